@@ -6,11 +6,13 @@ user's command line only. From a file it is accepted only if the module has been
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 
 from ce_gym.policies.errors import PolicyError
 
@@ -40,6 +42,19 @@ def environment_of(record: Mapping[str, Any], named: str | None = None) -> str:
             f"or the module that registers it: --env MODULE:{shown(name)}"
         )
     return env_id
+
+
+def registered(env_id: str) -> EnvSpec:
+    """Return the registration of an environment; `module:id` imports the module first, as `gymnasium.make` does.
+
+    Raises:
+        ModuleNotFoundError: If there is no such module.
+        gymnasium.error.Error: If the environment is not registered.
+    """
+    module, _, name = env_id.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    return gymnasium.spec(name)
 
 
 def shown(text: str) -> str:

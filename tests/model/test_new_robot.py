@@ -81,7 +81,7 @@ def test_the_command_says_how_to_go_on(pup, capsys):
     assert main(["new", str(pup)]) == 0
     out = capsys.readouterr().out
     assert "8 joints, 12 contact spheres" in out
-    assert "--env my_robots:ce_gym/PupVelocity-v0" in out
+    assert "train my_robots:ce_gym/PupVelocity-v0" in out
     assert main(["inspect", str(pup.with_suffix(".yaml")), "--no-errors"]) == 0
     assert "Environments: it has what every task needs" in capsys.readouterr().out
     assert main(["inspect", "mit_humanoid_leg", "--no-errors"]) == 0

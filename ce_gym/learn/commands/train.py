@@ -7,8 +7,6 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
-import gymnasium
-
 from ce_gym.console import EPISODES, NUM_ENVS, SEED, STEPS, above_zero, add_command, add_threads_argument
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.learn.runs.job import Job
@@ -16,7 +14,7 @@ from ce_gym.learn.runs.logs import LOGS, default_logs
 from ce_gym.learn.study import study_jobs, unfinished
 from ce_gym.learn.training import ALGORITHMS, run_job
 from ce_gym.model.mechanism import ELASTIC, LEVELS
-from ce_gym.policies import add_env_arg, load_policy
+from ce_gym.policies import add_env_arg, load_policy, registered
 
 
 def add_train_command(subparsers: Any) -> None:
@@ -77,7 +75,7 @@ def train(args: argparse.Namespace) -> int:
     from ce_gym.viewer.watch.process import TrainingPage
 
     jobs = make_jobs(args)
-    gymnasium.spec(jobs[0].env_id)  # an unknown environment is an error before any output
+    registered(jobs[0].env_id)  # an unknown environment is an error before any output
     with TrainingPage([job.out for job in jobs], jobs[0].env_id) if args.page else contextlib.nullcontext():
         for job in jobs:
             remaining = unfinished(job) if len(jobs) > 1 else job

@@ -11,8 +11,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import gymnasium
-
 from ce_gym.learn.evaluation.crossing import cross
 from ce_gym.learn.evaluation.effort import effort
 from ce_gym.learn.evaluation.episodes import weights_seed
@@ -26,7 +24,7 @@ from ce_gym.learn.runs.progress import LOG, read_curve
 from ce_gym.learn.runs.settings import config_file, load_settings
 from ce_gym.learn.training import learner, learner_of
 from ce_gym.model.mechanism import LEVELS
-from ce_gym.policies import Policy, PolicyError, keep_map, locate_policy, read_actor, shelf, write_npz
+from ce_gym.policies import Policy, PolicyError, keep_map, locate_policy, read_actor, registered, shelf, write_npz
 
 FINER = 5
 """Ratio of sub-step lengths of a second evaluation, because a policy may rely on the length of its training."""
@@ -61,7 +59,7 @@ def card_results(policy: Policy, episodes: int, sim2sim_robots: int, levels: Seq
         level: evaluate(policy, env_id, **common, **{**kwargs, "transmission": level})
         for level in dict.fromkeys((*levels, trained))
     }
-    longest = gymnasium.spec(env_id).max_episode_steps or math.inf
+    longest = registered(env_id).max_episode_steps or math.inf
     result: dict[str, Any] = {
         "seed": seed,
         "levels": by_level,

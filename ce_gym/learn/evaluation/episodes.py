@@ -6,7 +6,6 @@ Each environment of a batch plays exactly one episode, so that short episodes do
 from __future__ import annotations
 
 import hashlib
-import importlib
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -18,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from ce_gym.console import progress
-from ce_gym.policies import Actor
+from ce_gym.policies import Actor, registered
 
 Array = NDArray[np.float64]
 
@@ -59,11 +58,7 @@ def weights_seed(policy: Any) -> int:
 
 def without_curricula(env_id: str, kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """Return arguments of an environment that starts robots on all terrain levels, with the full command range."""
-    module, _, name = env_id.rpartition(":")
-    if module:  # as `gymnasium.make` does
-        importlib.import_module(module)
-    registered = gymnasium.registry[name].kwargs if name in gymnasium.registry else {}
-    arguments, changed = {**registered, **kwargs}, {}
+    arguments, changed = {**registered(env_id).kwargs, **kwargs}, {}
     terrain = arguments.get("terrain", "flat")
     terrain = dict(terrain) if isinstance(terrain, Mapping) else {"kind": terrain}
     if terrain.get("kind") not in ("flat", "map"):
