@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
+from ball_joints import with_balls
+from small_mechanisms import ball
+from tripod import TRIPOD
 
-from ce_gym import Model, Simulator
+from ce_gym import Model, Simulator, Terrain
 
 
 def free_leg(dtype: str = "float64") -> Simulator:
@@ -87,3 +92,85 @@ def test_jax_gradients():
         change = np.random.default_rng(3).normal(size=given.shape) * 1e-6
         slope = float(put(given + change) - put(given - change)) / 2
         assert abs(float((found * change).sum()) - slope) < 1e-6 * abs(slope)
+
+
+def make_jax_steps(sim: Simulator, n_substeps: int = 1):
+    """Return jax and the result of `make_steps`."""
+    jax = pytest.importorskip("jax")
+    pytest.importorskip("numba")
+    from ce_gym.adapters.jax import make_steps
+
+    jax.config.update("jax_enable_x64", True)
+    steps, start = make_steps(sim, n_substeps)
+    return jax, steps, start
+
+
+@pytest.mark.parametrize(("robot", "num_envs"), [(TRIPOD, 1), (TRIPOD, 35), (ball(), 8), (with_balls(True), 11)])
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_jax_steps_have_the_bits_of_the_simulator(robot, num_envs, dtype):
+    model, rng = Model(robot), np.random.default_rng(num_envs)
+    terrain = Terrain(rng.uniform(0.0, 0.02, (20, 24)), 0.1, (-1.0, -1.0)) if robot == TRIPOD and num_envs > 8 else None
+    sim = Simulator(model, num_envs, dtype=dtype, parameters=("gravity",), terrain=terrain)
+    targets = rng.normal(0, 0.2, (num_envs, len(sim.target_names))).astype(dtype)
+    sim.step(targets, 10)
+    jax, steps, start = make_jax_steps(sim, 3)
+    sim.set_parameter("gravity", rng.uniform(-9, -2, (num_envs, 3)))
+    after = steps(jax.jit(steps)(start, targets), targets)
+    np.testing.assert_array_equal(sim.q, start["q"])  # the simulator has not moved
+    sim.step(targets, 6)
+    assert np.abs(sim.v - start["v"]).max() > 1e-3
+    for name, rows in after.items():
+        np.testing.assert_array_equal(rows, sim._batch.rows(name), err_msg=name)
+
+
+def test_jax_steps_scale_quaternions_and_give_nan_for_invalid_robots():
+    sim = Simulator(Model(with_balls(True)), 6)
+    _, steps, start = make_jax_steps(sim)
+    q, target = start["q"].copy(), np.zeros((6, len(sim.target_names)))
+    q[0, 3:7] *= 1.0005
+    q[1, 7:11] *= 0.9995
+    q[2, 3:7] *= 1.002
+    q[3, -5] = np.nan
+    target[4, 0] = np.inf
+    after = steps({**start, "q": q}, target)
+    expected = steps(start, np.zeros_like(target))
+    for name, rows in after.items():
+        valid = np.array([0, 1, 5])
+        np.testing.assert_allclose(rows[valid], expected[name][valid], rtol=1e-12, atol=1e-14)
+        assert np.isnan(rows[2:5]).all()
+
+
+def test_jax_steps_of_other_shapes_and_types_are_refused():
+    _, steps, start = make_jax_steps(free_leg())
+    with pytest.raises(
+        ValueError, match=r"^q is float32 \(3, 2\); expected float64 \(3, 2\); float64 needs jax_enable_x64"
+    ):
+        steps({**start, "q": start["q"].astype("float32")}, np.zeros((3, 2)))
+    with pytest.raises(ValueError, match=r"^target is float64 \(2,\); expected float64 \(3, 2\)"):
+        steps(start, np.zeros(2))
+
+
+def test_jax_steps_in_batches_and_threads():
+    jax, steps, start = make_jax_steps(free_leg(), 20)
+    steps = jax.jit(steps)
+    targets = np.random.default_rng(2).normal(size=(8, 3, 2))
+    each = [steps(start, target)["q"] for target in targets]
+    np.testing.assert_array_equal(jax.vmap(steps, (None, 0))(start, targets)["q"], each)
+    with ThreadPoolExecutor(4) as threads:
+        for _ in range(20):
+            np.testing.assert_array_equal(list(threads.map(lambda target: steps(start, target)["q"], targets)), each)
+
+
+def test_jax_steps_of_one_thread_call_no_python():
+    for num_threads in (1, 2):
+        jax, steps, start = make_jax_steps(Simulator(Model("planar_leg_linkage"), num_threads=num_threads))
+        text = jax.jit(steps).lower(start, np.zeros((1, 2))).as_text()
+        assert ("callback" in text) == (num_threads > 1)
+
+
+def test_state_passes_to_torch_without_a_copy():
+    torch, numba = pytest.importorskip("torch"), pytest.importorskip("ce_gym.numba")
+    sim = free_leg()
+    shared = torch.from_dlpack(numba.stepper(sim)[0].q)
+    sim.reset()
+    np.testing.assert_array_equal(shared[0, :, 2], sim.q[2])
