@@ -29,6 +29,11 @@ from ce_gym.learn.training import learner
 ROOT = Path(__file__).parents[2]
 KINDS = {"reward": "Rewards", "observation": "Observations", "termination": "Terminations", "metric": "Metrics"}
 
+UNIT = re.compile(r" ?\[(?!-?\d)([^\]]+)\]")
+"""A unit in brackets; a range such as [-1, 1] is none."""
+SHAPE = re.compile(r",? ?(?:shape )?(\((?:[^()]|\([^()]*\))*,[^()]*\)(?: or \([^()]*\))?)(?: each)?")
+"""A shape such as (3,), (n,) or (0,)."""
+
 
 def terms() -> str:
     """Return one table for each kind of term: name, parameters with defaults, meaning, unit."""
@@ -46,10 +51,13 @@ def context() -> str:
         if name.startswith("_") or not isinstance(member, property | cached_property):
             continue
         text = " ".join((inspect.getdoc(member) or "").split("\n\n")[0].split())
-        shape = re.search(r"(?:shape )?(\([^()]*(?:\([^()]*\)[^()]*)*,[^()]*\))(?: each)?", text)
-        units = re.findall(r"\[([^\]]+)\]", text)
-        meaning = re.sub(r",? ?(?:shape )?\([^()]*,[^()]*\)(?: each)?", "", re.sub(r" ?\[[^\]]+\]", "", text))
-        rows.append((f"`s.{name}`", shape[1] if shape else "scalar", ", ".join(dict.fromkeys(units)) or "-", meaning))
+        text, unit = _split_unit(text)
+        found = SHAPE.search(text)
+        shape = found[1] if found else "scalar"
+        getter: Any = member.fget if isinstance(member, property) else member.func
+        if str(getter.__annotations__.get("return", "")).startswith("list"):
+            shape = f"list, {shape} each"
+        rows.append((f"`s.{name}`", shape, unit, SHAPE.sub("", text, count=1)))
     functions = [f for name, f in vars(TermContext).items() if inspect.isfunction(f) and not name.startswith("_")]
     methods = [(f"`s.{f.__name__}({_call(f)})`", _first_line(f)) for f in functions]
     columns = ("Name", "Shape", "Unit", "Meaning")
@@ -168,8 +176,8 @@ def _meaning_and_unit(function: Any) -> tuple[str, str]:
 
 def _split_unit(text: str) -> tuple[str, str]:
     """Return a text without its units in brackets, and the units, "-" if there are none."""
-    units = re.findall(r"\[([^\]]+)\]", text)
-    return re.sub(r" ?\[[^\]]+\]", "", text), ", ".join(dict.fromkeys(units)) or "-"
+    units = UNIT.findall(text)
+    return UNIT.sub("", text), ", ".join(dict.fromkeys(units)) or "-"
 
 
 def _subcommands(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
