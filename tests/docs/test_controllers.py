@@ -61,9 +61,12 @@ def test_mppi():
 
 @pytest.mark.slow
 def test_kalman_filter():
-    pytest.importorskip("numba")
+    numba = pytest.importorskip("numba")
     pytest.importorskip("scipy")
+    num_threads = numba.get_num_threads()
+    numba.set_num_threads(1)  # on a busy machine, threads wait for each other in each of 500 calls
     errors = example("kalman_filter")["main"](n=16)
+    numba.set_num_threads(num_threads)
     angle, speed = errors[-100:].mean((0, 2))
     assert np.degrees(errors[0, 0].mean()) > 8
     assert np.degrees(angle) < 0.3
