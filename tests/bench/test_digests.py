@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from pathlib import Path
 
 import pytest
@@ -19,17 +18,17 @@ INERTIA = 0.042673
 
 @pytest.fixture
 def changed(tmp_path: Path) -> str:
-    """A copy of the robot in which one moment of inertia is larger by one bit."""
+    """A copy of the robot in which one moment of inertia is larger by some bits; one bit can vanish in a rounding."""
     for kind in ("yaml", "urdf"):
         text = (assets_folder() / ROBOT / f"{ROBOT}.{kind}").read_text()
         assert kind == "yaml" or f'izz="{INERTIA}"' in text
-        more = text.replace(f'izz="{INERTIA}"', f'izz="{math.nextafter(INERTIA, 1)!r}"')
+        more = text.replace(f'izz="{INERTIA}"', f'izz="{INERTIA * (1 + 1e-14)!r}"')
         (tmp_path / f"{ROBOT}.{kind}").write_text(more)
     return str(tmp_path / f"{ROBOT}.yaml")
 
 
 @pytest.mark.parametrize("kind", ["model", "simulator"])
-def test_one_bit_of_the_physics_is_another_digest(kind: str, changed: str) -> None:
+def test_the_smallest_change_of_the_physics_is_another_digest(kind: str, changed: str) -> None:
     first, again, other = (row(Case(kind, name, "exact")) for name in (ROBOT, ROBOT, changed))
     assert first == again
     assert any(first[name]["digest"] != other[name]["digest"] for name in first)
@@ -49,7 +48,7 @@ def test_the_command_says_which_rows_differ_and_by_how_much(
     out = capsys.readouterr().out
     assert "1 of 4 differ" in out
     lines = [line for line in out.splitlines() if line.startswith("model four_bar")]
-    assert any(0 < float(line.split()[-2]) < 1e-14 for line in lines)
+    assert any(0 < float(line.split()[-2]) < 1e-12 for line in lines)
 
 
 def test_what_is_no_record_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -159,7 +159,7 @@ def test_the_page_gets_curves_and_the_present_policy(watched: tuple[Path, Watchi
     assert (len(state["command"]), len(state["moves"])) == (3, 3)
     policy(run / "policy.npz", bias=-0.3, steps=500)
     events.next("message", lambda data: data["state"]["policy_steps"] == 500)
-    policy(run / "policy.npz", steps=600)
+    policy(run / "policy.npz", steps=600, ended=True)
     state = events.next("message", lambda data: data["state"]["ended"])["state"]
     assert (state["finished"], state["notice"]) == (True, "")
 
@@ -198,7 +198,7 @@ def test_it_ends_with_its_input_and_leaves_nothing(tmp_path: Path):
 @pytest.mark.slow
 @pytest.mark.skipif(PROGRAM is None, reason="no Chromium here: install chromium (Debian's package) to run this")
 def test_the_page_in_a_browser(run: Path):
-    policy(run / "policy.npz")
+    policy(run / "policy.npz", ended=True)
     with serving(Watcher([run])) as url, Chromium(url, size=(500, 900)) as browser:
         browser.until("plots && received > 10 && find('waiting').style.display === 'none'")
         assert browser.run(

@@ -91,7 +91,7 @@ def _learn(learner: Any, job: Job) -> Trained:
                     save(learner, record(), job.out / "policy")
         bar.bar.close()
         log.close()
-    written = record(finished=not stop.interrupted)
+    written = record(finished=not stop.interrupted) | {"ended": True}
     try:
         policy = save(learner, written, job.out / "policy")
     except OSError as error:

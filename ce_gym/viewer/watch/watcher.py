@@ -159,7 +159,7 @@ class Watcher(LivePage):
             "seconds": newest.seconds if newest else 0.0,
             "total": total if isinstance(total, int | float) else None,
             "policy_steps": self._record.get("steps"),
-            "ended": self._newest is not None and self._newest[1].parent in self._runs,  # a run's final policy
+            "ended": self._record.get("ended") is True,
             "finished": self._record.get("finished") is True,
             "making": self._job is not None and self._walker is None,
             "notice": self.notice,
