@@ -7,7 +7,6 @@ user can fix are one line on stderr and exit code 2.
 from __future__ import annotations
 
 import argparse
-import importlib
 import importlib.util
 import os
 import re
@@ -26,7 +25,7 @@ from ce_gym.learn.commands.evaluate import (
 )
 from ce_gym.learn.commands.export import add_export_command
 from ce_gym.learn.commands.train import add_train_command
-from ce_gym.policies import add_env_arg
+from ce_gym.policies import add_env_arg, import_module_of
 from ce_gym.viewer.cli import add_live_command, add_play_command, add_view_command, add_watch_command
 
 WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmission dynamics.
@@ -223,11 +222,8 @@ def _inspect_environment(args: argparse.Namespace) -> int:
     from ce_gym.diagnostics.scene import scene_report
     from ce_gym.model import RobotError
 
-    module, _, name = args.name.rpartition(":")
     try:
-        if module:
-            importlib.import_module(module)  # registers it, as in `gymnasium.make`
-        print(scene_report(name, **dict(args.env_args)))
+        print(scene_report(import_module_of(args.name), **dict(args.env_args)))
     except ImportError as error:
         raise RobotError(f"environment {args.name!r}: {error}") from error
     except ValueError as error:

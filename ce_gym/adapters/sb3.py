@@ -18,6 +18,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from ce_gym.policies import import_module_of
+
 _RUNNING: dict[str, Any] = {}
 """Information dictionary of every environment whose episode continues; shared, so it must not be changed."""
 
@@ -190,7 +192,7 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwa
     """Return a batch of environments with the interface of Stable-Baselines3.
 
     Args:
-        env_id: Registered id, such as `"ce_gym/MiniCheetahVelocity-v0"`.
+        env_id: Registered id, such as `"ce_gym/MiniCheetahVelocity-v0"`; `"my_module:id"` imports `my_module` first.
         num_envs: Number of environments.
         seed: Seed of the first reset; environment i gets `seed + i`. None seeds from the operating system.
         **kwargs: Arguments of the environment, such as `transmission="armature"`, `num_threads=2` or `obs_mode="dict"`
@@ -214,9 +216,13 @@ def make_sb3_vec_env(env_id: str, num_envs: int = 1, seed: int | None = 0, **kwa
     mode = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT
     options = {"autoreset_mode": AutoresetMode.SAME_STEP, **kwargs}
     try:
-        envs = SB3VecEnv(gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode=mode, **options))
+        name = import_module_of(env_id)
+        envs = gymnasium.make_vec(name, num_envs=num_envs, vectorization_mode=mode, **options)
     except (TypeError, ImportError) as error:  # an unknown argument or module
         raise ValueError(f"environment {env_id!r}: {error}") from error
+    if spec := envs.unwrapped.spec:
+        spec.id = env_id.removesuffix(name) + spec.id  # `ce_gym.policies.save` records the module too
+    adapted = SB3VecEnv(envs)
     if seed is not None:
-        envs.seed(seed)
-    return envs
+        adapted.seed(seed)
+    return adapted

@@ -3,7 +3,7 @@
 from ce_gym.model.errors import listed_names
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.arguments import add_env_arg, add_env_arguments, checked_arguments, parse_yaml
-from ce_gym.policies.environments import environment_of, registered
+from ce_gym.policies.environments import environment_of, import_module_of, registered
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.files import load_policy, read_actor, write_npz
 from ce_gym.policies.height_maps import keep_map, with_map
@@ -26,6 +26,7 @@ __all__ = [
     "environment_of",
     "environment_record",
     "find_policy",
+    "import_module_of",
     "keep_map",
     "listed_names",
     "load_policy",

@@ -44,6 +44,23 @@ def environment_of(record: Mapping[str, Any], named: str | None = None) -> str:
     return env_id
 
 
+def import_module_of(env_id: str) -> str:
+    """Import the module of an id `module:id`, as `gymnasium.make` does, and return the id after the colon.
+
+    Raises:
+        ModuleNotFoundError: If there is no such module. Its `name` is None: no package to install provides the module.
+    """
+    module, _, name = env_id.rpartition(":")
+    try:
+        if module:
+            importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if f"{module}.".startswith(f"{error.name}."):
+            raise ModuleNotFoundError(f"no module named {module!r}; expected a module on PYTHONPATH") from None
+        raise  # the module imports a package that is not installed
+    return name
+
+
 def registered(env_id: str) -> EnvSpec:
     """Return the registration of an environment; `module:id` imports the module first, as `gymnasium.make` does.
 
@@ -51,10 +68,7 @@ def registered(env_id: str) -> EnvSpec:
         ModuleNotFoundError: If there is no such module.
         gymnasium.error.Error: If the environment is not registered.
     """
-    module, _, name = env_id.rpartition(":")
-    if module:
-        importlib.import_module(module)
-    return gymnasium.spec(name)
+    return gymnasium.spec(import_module_of(env_id))
 
 
 def shown(text: str) -> str:

@@ -157,12 +157,13 @@ def _id_and_arguments(env: Any) -> tuple[str, dict[str, Any]]:
         PolicyError: If the environment has no id, or an argument is not plain data.
     """
     spec = env.get_attr("spec")[0] if hasattr(env, "get_attr") else getattr(env, "spec", None)
-    if spec is None or spec.id not in gymnasium.registry:
+    name = spec.id.rpartition(":")[2] if spec else None  # `make_sb3_vec_env` keeps the module of `module:id`
+    if spec is None or name not in gymnasium.registry:
         raise PolicyError(
             f"env of type {type(env).__name__}: has no registered id; expected an environment made by gymnasium.make, "
             "gymnasium.make_vec or make_sb3_vec_env"
         )
-    registered = gymnasium.registry[spec.id]
+    registered = gymnasium.registry[name]
     defaults = {"max_episode_steps": registered.max_episode_steps, **registered.kwargs}
     kwargs = {key: x for key, x in spec.kwargs.items() if key not in RESERVED and key != "num_threads"}
     try:

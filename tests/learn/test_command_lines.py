@@ -12,7 +12,7 @@ from point_mass import ID
 from toy import FAST
 
 from ce_gym.__main__ import _parser, main
-from ce_gym.policies import write_npz
+from ce_gym.policies import load_policy, write_npz
 from ce_gym.policies.actor import Actor
 
 LEARNING = ("train", "evaluate", "transfer", "sim2sim", "export", "card")
@@ -82,6 +82,14 @@ def test_arguments_that_an_environment_does_not_take_are_one_line(tmp_path, caps
     assert "num_envs" in one_line(["evaluate", str(tmp_path / "policy.npz")], capsys)
 
 
+def test_the_module_of_an_id_is_imported_and_recorded(tmp_path, monkeypatch):
+    (tmp_path / "my_points.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["train", f"my_points:{ID}", "--out", str(tmp_path / "run"), *FAST]) == 0
+    assert load_policy(tmp_path / "run").record["env"] == f"my_points:{ID}"
+    monkeypatch.delitem(sys.modules, "my_points")
+
+
 def test_ctrl_c_before_learning_starts_is_one_line(tmp_path, capsys, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
@@ -140,6 +148,7 @@ def test_command_lines_that_make_no_sense_are_one_line(argv, words, tmp_path, ca
     [
         (["train"], "ENV: missing; expected an environment id"),
         (["train", "nobody/Nothing-v0"], "Namespace nobody not found"),
+        (["train", f"absent:{ID}"], "no module named 'absent'; expected a module on PYTHONPATH"),
         (["train", "ce_gym/MiniCheetaVelocity-v0"], "Did you mean: `MiniCheetahVelocity`?"),
         (["train", "--resume", "mini_cheetah_velocity", "--out", "x"], "--resume "),
         (["sim2sim", "mini_cheetah_backflip"], "has no commanded velocities; expected a task with them"),

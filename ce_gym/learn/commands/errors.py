@@ -90,7 +90,7 @@ def _missing(error: ModuleNotFoundError) -> str:
     Raises:
         ModuleNotFoundError: If the missing module belongs to ce_gym.
     """
-    if error.name is None:  # Gymnasium's error about the module of an id
+    if error.name is None:  # the module of an environment's id, which no package provides
         return _line(error)
     package = error.name.split(".")[0]
     if package == "ce_gym":

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ce_gym.envs.base import BaseEnv
-from ce_gym.policies import environment_of, load_policy
+from ce_gym.policies import environment_of, import_module_of, load_policy
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.rollouts.recording import Act, record_lanes
 from ce_gym.viewer.rollouts.rollout import Rollout
@@ -71,7 +71,7 @@ def make_envs(env_id: str, robots: int, options: Mapping[str, Any]) -> tuple[Any
     import gymnasium
 
     try:
-        envs = gymnasium.make_vec(env_id, robots, vectorization_mode="vector_entry_point", **options)
+        envs = gymnasium.make_vec(import_module_of(env_id), robots, vectorization_mode="vector_entry_point", **options)
     except (TypeError, ValueError, ImportError, gymnasium.error.Error) as error:
         raise ViewerError(f"environment {env_id!r}: {' '.join(str(error).split())}") from error
     native = envs.unwrapped
