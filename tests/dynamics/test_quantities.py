@@ -29,7 +29,7 @@ QUICK = ("mini_cheetah", "tello", "mit_humanoid_leg", "planar_leg_linkage")
 APPROXIMATED = ("mini_cheetah", "tello", "mit_humanoid_leg", "awkward", "four_bar")
 CASES = [(name, "exact") for name in (*BUILT, *QUICK)]
 CASES += [(name, level) for name in APPROXIMATED for level in LEVELS[1:]] + [("mini_cheetah", "elastic")]
-SLOW = [(name, level) for name in robots() for level in LEVELS if (name, level) not in CASES]
+OTHERS = [(name, level) for name in robots() for level in LEVELS if (name, level) not in CASES]
 STATES = 3
 NARROW = {"dr_legs": 0.05}
 
@@ -65,7 +65,7 @@ class Case:
 
 @pytest.fixture(
     scope="module",
-    params=[*CASES, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)],
+    params=[*CASES, *(pytest.param(case, marks=pytest.mark.stress) for case in OTHERS)],
     ids=lambda case: "-".join(case),
 )
 def case(request: pytest.FixtureRequest, awkward_robot) -> Case:

@@ -24,7 +24,7 @@ MAY_IMPORT = {
     "numba": {"model", "dynamics", "compile", "sim"},
     "envs": {"model", "dynamics", "compile", "sim"},
     "diagnostics": {"model", "dynamics", "compile", "sim", "envs"},
-    "adapters": {"model", "envs"},
+    "adapters": {"model", "envs", "policies"},
     "policies": {"model"},
     "viewer": {"model", "dynamics", "sim", "envs", "policies"},
     "identify": {"model", "dynamics", "compile", "sim", "viewer"},
