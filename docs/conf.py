@@ -1,7 +1,7 @@
 """How Sphinx builds this documentation: `make docs`. Pages written from the package itself come from `_ext/`.
 
-A warning is an error (see the Makefile). What is not installed is replaced by stand-ins, so that the pages can be
-built without learners and viewers. Knows Sphinx, and `ce_gym` only by name.
+A warning is an error (see the Makefile). Packages that are not installed are replaced by stand-ins, so that the pages
+can be built without learners and viewers. Knows Sphinx, and `ce_gym` only by name.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ html_css_files = ["ce_gym.css"]
 html_copy_source = html_show_sourcelink = False
 pygments_style, pygments_dark_style = "friendly", "github-dark"
 
-# `make links` follows links out of these pages, and those of README, which is none of them.
+# `make links` follows the links of these pages and of README.
 linkcheck_timeout, linkcheck_retries, linkcheck_workers = 20, 2, 4
 linkcheck_anchors = False  # many sites write theirs by script
 

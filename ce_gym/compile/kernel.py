@@ -23,14 +23,14 @@ class Kernel:
     """Machine code that processes tiles of environments. Several threads may call the same kernel at a time.
 
     Attributes:
-        name: of the program.
-        dtype: of the lanes.
-        lanes: environments in a tile.
-        buffers: by name.
-        repeats: names of the run-time integers.
-        code: the machine code.
-        digest: name of the kernel in the cache, which depends on the whole program.
-        arguments: buffers whose arrays the caller passes, in the order of their addresses.
+        name: Name of the program.
+        dtype: Type of the numbers in lanes.
+        lanes: Environments in a tile.
+        buffers: Buffers by name.
+        repeats: Names of the run-time integers.
+        code: The machine code.
+        digest: Name of the kernel in the cache, which depends on the whole program.
+        arguments: Buffers whose arrays the caller passes, in the order of their addresses.
         scratch_words: 64-bit words of memory for each thread.
     """
 
@@ -66,10 +66,10 @@ class Kernel:
         """Run the program on every tile.
 
         Args:
-            arrays: by name of the buffer: `tiles`, shape (n_tiles, size, lanes); `rows_*`, shape (num_envs, size);
-                tables, shape (rows, columns). Other arrays are ignored. The program changes its outputs in place.
-            num_envs: number of environments; the last tile may be padded.
-            repeats: a number for each of `self.repeats`.
+            arrays: Arrays by name of the buffer: `tiles`, shape (n_tiles, size, lanes); `rows_*`, shape (num_envs,
+                size); tables, shape (rows, columns). Other arrays are ignored. Outputs are changed in place.
+            num_envs: Number of environments; the last tile may be padded.
+            repeats: A number for each entry of `self.repeats`.
             keys: uint64, shape (num_envs,), if the program draws random numbers.
             counters: int64, shape (num_envs,), if the program draws random numbers.
             num_threads: threads that share the tiles; the result does not depend on this number.

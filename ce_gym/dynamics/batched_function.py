@@ -77,7 +77,7 @@ class BatchedFunction:
             arguments: Its inputs without "guess", shape (..., n) each.
 
         Returns:
-            Its outputs, shape (..., rows, columns), and whether all of them are numbers.
+            The outputs, shape (..., rows, columns), and whether all entries are numbers.
 
         Raises:
             ValueError: If a shape is wrong.
@@ -179,7 +179,7 @@ class BatchedFunction:
         return [*calls, Call(checked, read, tuple(checked.name_out()))]
 
     def _checked_function(self) -> ca.Function:
-        """Return the function with transposed outputs, and a check that is 0 if all of them are numbers."""
+        """Return the function with transposed outputs, and a check that is 0 if all entries are numbers."""
         symbols = {name: SX.sym(name, size) for name, size in self.inputs.items()}
         inputs, arguments = dict(symbols), dict(symbols)
         if GUESS in self.function.name_in():

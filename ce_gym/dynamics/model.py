@@ -527,7 +527,7 @@ class Model:
     def coriolis_matrix(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Return the matrix `C` of `M vdot + C v + g = tau`, shape (..., nv, nv); `Mdot - 2 C` is skew-symmetric.
 
-        The factorisation is that of Christoffel's symbols, extended to the base and to ball joints, as in Pinocchio.
+        The factorisation has Christoffel's symbols, extended to the base and to ball joints, as in Pinocchio.
         """
         return self.evaluate("coriolis_matrix", q, v)[0]
 

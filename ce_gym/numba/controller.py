@@ -48,6 +48,6 @@ def controller(function: Callable[..., None], dtype: str = "float64") -> Control
             shape (nq,), velocities, shape (nv,), and targets of `Simulator.step`, shape (n_targets,). It writes the
             targets of the sub-step into `target`. The arrays are views with strides. Threads call the function for
             different robots at the same time. Exceptions are printed, not raised.
-        dtype: "float64" or "float32": that of the simulator.
+        dtype: "float64" or "float32", as the simulator has.
     """
     return Controller(function, dtype)

@@ -24,11 +24,11 @@ def quantity(model: Model, name: str) -> Callable[..., Any]:
     """Return a quantity of a robot as an `@njit` function.
 
     The function takes C-contiguous or other arrays of one robot, shape (n,), or of many, shape (..., n), with the same
-    number of rows each. It returns what the method of `Model` with the same name returns. Where the method raises a
-    ValueError because of a quaternion or a loop, results are not numbers. Several threads may call the function.
+    number of rows each. It returns the same arrays as the method of `Model` with the same name. Where the method raises
+    a ValueError because of a quaternion or a loop, results are not numbers. Several threads may call the function.
 
     Args:
-        model: The robot at a transmission level. Its `dtype` is that of the results; `num_threads` is ignored.
+        model: The robot at a transmission level. Results have its `dtype`; `num_threads` is ignored.
         name: Name of the quantity, see `Model.casadi_function`.
 
     Raises:

@@ -48,7 +48,7 @@ def import_module_of(env_id: str) -> str:
     """Import the module of an id `module:id`, as `gymnasium.make` does, and return the id after the colon.
 
     Raises:
-        ModuleNotFoundError: If there is no such module. Its `name` is None: no package to install provides the module.
+        ModuleNotFoundError: If there is no such module. Its `name` is None, because no package can be installed for it.
     """
     module, _, name = env_id.rpartition(":")
     try:

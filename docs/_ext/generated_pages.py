@@ -38,7 +38,7 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 def write_pages(folder: Path) -> None:
     """Write every generated page into a folder."""
-    warnings.simplefilter("ignore", InertiaWarning)  # what it says stands on the robots' pages
+    warnings.simplefilter("ignore", InertiaWarning)  # robots' pages contain its text
     (folder / "robots").mkdir(parents=True, exist_ok=True)
     for robot in robots():
         _write(folder / "robots" / f"{robot}.md", robot_page(robot, folder / "robots"))

@@ -29,7 +29,7 @@ ROUNDING = 1e-12
 
 @cache
 def shipped(name: str) -> Robot:
-    """Return a robot that ships with the package; what is warned of stands among its notes."""
+    """Return a robot that ships with the package, without warnings; its notes contain them."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InertiaWarning)
         return load_robot(name)

@@ -9,7 +9,7 @@ from point_mass import ID
 from toy import FAST, job
 
 from ce_gym.__main__ import main
-from ce_gym.learn.runs import training
+from ce_gym.learn.runs import loop
 from ce_gym.learn.training import run_job
 from ce_gym.viewer.watch.process import TrainingPage
 
@@ -24,8 +24,8 @@ def test_the_current_policy_is_written_during_training(algo, tmp_path, monkeypat
             steps.append(record["steps"])
         return save(learner, record, path)
 
-    save = training.save
-    monkeypatch.setattr(training, "save", record_steps)
+    save = loop.save
+    monkeypatch.setattr(loop, "save", record_steps)
     monkeypatch.setattr(time, "monotonic", lambda: clock.__setitem__(0, clock[0] + 1.1) or clock[0])
     trained = run_job(job(tmp_path, 10_000, algo=algo))
     assert steps[0] == 1024

@@ -21,9 +21,9 @@ from ce_gym.learn.learners.learner import Learner, space_sizes
 from ce_gym.learn.networks.perceptron import squared_error_gradient
 from ce_gym.learn.networks.updates import adam
 from ce_gym.learn.runs.job import Job, Trained
+from ce_gym.learn.runs.loop import run_learner
 from ce_gym.learn.runs.progress import geometric, linear
 from ce_gym.learn.runs.settings import CONFIG_FOLDER, CommonSettings
-from ce_gym.learn.runs.training import run_learner
 from ce_gym.model.arguments import check
 from ce_gym.model.options import option
 from ce_gym.policies import Policy, PolicyError, load_policy

@@ -13,9 +13,9 @@ from ce_gym.learn.learners.learner import SHARES, Learner, space_sizes
 from ce_gym.learn.networks.perceptron import FIGURES, actor_gradient, squared_error_gradient
 from ce_gym.learn.networks.updates import adam, sample_actions
 from ce_gym.learn.runs.job import Job, Trained
+from ce_gym.learn.runs.loop import run_learner
 from ce_gym.learn.runs.progress import adapted_rate, fall_cost, geometric, linear
 from ce_gym.learn.runs.settings import Settings as Settings  # of this learner
-from ce_gym.learn.runs.training import run_learner
 
 F = np.float32
 

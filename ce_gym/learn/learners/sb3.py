@@ -24,9 +24,9 @@ from stable_baselines3.common.utils import FloatSchedule
 from ce_gym.adapters.sb3 import SB3VecEnv
 from ce_gym.adapters.sb3_asymmetric import AsymmetricPolicy
 from ce_gym.learn.runs.job import Job, Trained
+from ce_gym.learn.runs.loop import run_learner
 from ce_gym.learn.runs.progress import adapted_rate, fall_cost, geometric, linear, spread_episodes
 from ce_gym.learn.runs.settings import Settings as Settings  # of this learner
-from ce_gym.learn.runs.training import run_learner
 from ce_gym.policies import Actor
 
 TRANSIENT = ["_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"]
@@ -53,7 +53,7 @@ class Episodes(BaseCallback):
 
 
 class SB3Learner:
-    """PPO of Stable-Baselines3 as a learner of `ce_gym.learn.runs.training`.
+    """PPO of Stable-Baselines3 as a learner of `ce_gym.learn.runs.loop`.
 
     Args:
         envs: A vector environment in SAME_STEP autoreset mode.

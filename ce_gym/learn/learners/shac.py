@@ -21,9 +21,9 @@ from ce_gym.learn.learners.learner import Learner, space_sizes
 from ce_gym.learn.networks.perceptron import back_through, padded, squared_error_gradient
 from ce_gym.learn.networks.updates import adam
 from ce_gym.learn.runs.job import Job, Trained
+from ce_gym.learn.runs.loop import run_learner
 from ce_gym.learn.runs.progress import fall_cost, geometric
 from ce_gym.learn.runs.settings import CONFIG_FOLDER, ActorCriticSettings
-from ce_gym.learn.runs.training import run_learner
 from ce_gym.model.options import number, option, positive
 from ce_gym.policies import PolicyError
 
@@ -62,7 +62,7 @@ class SHAC(Learner):
         PolicyError: If the critic has an observation of its own.
 
     Attributes:
-        critic_updates: Number of Adam steps of the critic; `updates` counts those of the policy.
+        critic_updates: Number of Adam steps of the critic; `updates` counts the steps of the policy.
     """
 
     arrays = (*Learner.arrays, "target")
