@@ -25,7 +25,8 @@ def quantity(model: Model, name: str) -> Callable[..., Any]:
 
     The function takes C-contiguous or other arrays of one robot, shape (n,), or of many, shape (..., n), with the same
     number of rows each. It returns the same arrays as the method of `Model` with the same name. Where the method raises
-    a ValueError because of a quaternion or a loop, results are not numbers. Several threads may call the function.
+    a ValueError because of a quaternion or a loop, entries that depend on it are not numbers. Several threads may call
+    the function.
 
     Args:
         model: The robot at a transmission level. Results have its `dtype`; `num_threads` is ignored.
