@@ -48,6 +48,7 @@ myst_heading_anchors = 3
 html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "ce_gym"
+smartquotes = False  # quotes and dashes of commands are pasted into shells
 html_static_path = ["_static"]
 html_css_files = ["ce_gym.css"]
 html_copy_source = html_show_sourcelink = False

@@ -113,7 +113,10 @@ def command_line() -> str:
     """Return a section with a table of options for each subcommand of `python -m ce_gym`."""
     parts = []
     for name, parser in _subcommands(_parser()):
-        rows = [(_invocation(action), _default(action), action.help or "") for action in parser._actions]
+        rows = [
+            (_invocation(action), _default(action), (action.help or "").replace("<", "&lt;"))
+            for action in parser._actions
+        ]
         rows = [row for row in rows if row[0] != "`-h`, `--help`"]
         described = " ".join((parser.description or "").split())
         usage = " ".join(parser.format_usage().removeprefix("usage: ").split())
@@ -192,8 +195,10 @@ def _invocation(action: argparse.Action) -> str:
 
 
 def _default(action: argparse.Action) -> str:
-    unset = action.default in (None, False, argparse.SUPPRESS, [], ())
-    return "" if unset or not action.option_strings else f"`{action.default}`"
+    unset = action.default in (None, False, "", float("inf"), argparse.SUPPRESS, [], ())
+    several = isinstance(action.default, list | tuple)
+    shown = " ".join(map(str, action.default)) if several else action.default
+    return "" if unset or not action.option_strings else f"`{shown}`"
 
 
 def _rows(text: str, first: str, head: bool = False) -> list[list[str]]:
