@@ -12,7 +12,15 @@ import re
 from dataclasses import dataclass
 from functools import cache
 
-OPTIONS = {"std": "c++17", "fma": False, "prec_div": True, "prec_sqrt": True, "ftz": False, "disable_warnings": True}
+OPTIONS = {
+    "std": "c++17",
+    "fma": False,
+    "prec_div": True,
+    "prec_sqrt": True,
+    "ftz": False,
+    "no_cache": True,
+    "disable_warnings": True,
+}
 """Every operation is rounded to nearest and alone. Multiply-adds have been fused before, equally for every device, by
 `ce_gym.compile.lowering.graph`."""
 REGISTERS = 65536
