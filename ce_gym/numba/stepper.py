@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ce_gym.numba.kernel_call import kernel_call, scratch_size
+from ce_gym.sim.interruptible_runs import LONGEST
 from ce_gym.sim.simulator import Simulator
 
 
@@ -66,6 +67,7 @@ def stepper(simulator: Simulator) -> tuple[Robots, Callable[[Robots, int], None]
     def step(robots, n_substeps):
         """Advance all robots by `n_substeps` sub-steps of length `dt`."""
         n_tiles = -(-robots.num_envs // lanes)
-        call(robots.arrays, robots.scratch, n_substeps, 0, n_tiles, robots.num_envs)
+        for made in range(0, n_substeps, LONGEST):
+            call(robots.arrays, robots.scratch, min(LONGEST, n_substeps - made), 0, n_tiles, robots.num_envs)
 
     return robots, step

@@ -356,14 +356,16 @@ def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray
     step = StepVariables(model.mechanism, options)
     subdivide = subdivide_function(step, options.retry)
     arguments = [name for name in kernel.buffers if name in rows] + [RETRIES.name]
-    values = {**rows, RETRIES.name: np.zeros((n, 1)), PART.name: np.ones((n, 1)), LEFT.name: np.ones((n, 1))}
+    scratch = {variable.name: np.zeros((n, variable.size)) for name, variable in step.start.items() if name not in rows}
+    values = {**rows, **scratch, RETRIES.name: np.zeros((n, 1)), PART.name: np.ones((n, 1)), LEFT.name: np.ones((n, 1))}
     parts: list[_Part] = []
     while (values[PART.name] > 0).any():
         length = values[PART.name] * values[DT]
         state = {name: values[name] for name in arguments} | {DT: length}
         before, after = _in_tiles(state, dtype), _in_tiles(state, dtype)
         kernel(after | simulator._batch.tables | {"target": target}, n, {TIMES: 1})
-        tried = {step.tried[name].name: read_rows(after[name], n) for name in step.start}
+        tried = {step.tried[name].name: read_rows(after[name], n) for name in step.start if name in after}
+        tried |= {step.tried[name].name: values[name] for name in scratch}
         joints = tried[step.tried["v"].name][:, model.robot.layout.base_nv :]
         tried[step.tried[MOVED].name] = length * np.abs(joints).max(axis=1, initial=0.0, keepdims=True)
         results = call_on_batch(subdivide, [(values | tried)[name] for name in subdivide.name_in()])

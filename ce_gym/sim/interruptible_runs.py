@@ -9,15 +9,17 @@ from ce_gym.compile import CriticalSection
 from ce_gym.sim.substeps import TIMES
 
 NONE: Mapping[str, int] = {}
-LONGEST = 100_000
-"""Most sub-steps of all robots in one call of a kernel, which take a fraction of a second for any robot and method."""
-FEWEST = 16
-"""Smaller batches take as long as this many robots: the lanes of a tile."""
+LONGEST = 64
+"""Most sub-steps in one call of a kernel, for batches of any size.
+
+A kernel integrates momentum through all sub-steps of a call, see `ce_gym.dynamics.stepping.conservation`. A call in
+other pieces gives the same motion up to rounding.
+"""
 
 
-def longest_run(num_envs: int) -> int:
-    """Return the most sub-steps in one call of a kernel for a number of robots."""
-    return max(1, LONGEST // max(num_envs, FEWEST))
+def is_long(n_substeps: int) -> bool:
+    """Whether a call is made in pieces."""
+    return n_substeps > LONGEST
 
 
 def run_substeps(
@@ -29,7 +31,7 @@ def run_substeps(
     num_threads: int = 1,
     addresses: Mapping[str, int] = NONE,
 ) -> None:
-    """Call a kernel until it has made `n_substeps` sub-steps; results have the same bits as after a single call.
+    """Call a kernel until it has made `n_substeps` sub-steps.
 
     Args:
         kernel: Repeats sub-steps.
@@ -40,10 +42,9 @@ def run_substeps(
         num_threads: Threads that share the robots.
         addresses: Addresses of functions that the kernel calls, by name.
     """
-    longest = longest_run(num_envs)
     while True:
-        kernel(arrays, num_envs, repeats={TIMES: min(n_substeps, longest), **addresses}, num_threads=num_threads)
-        n_substeps -= longest
+        kernel(arrays, num_envs, repeats={TIMES: min(n_substeps, LONGEST), **addresses}, num_threads=num_threads)
+        n_substeps -= LONGEST
         if n_substeps <= 0:
             return
         section.interruption_point()

@@ -26,7 +26,7 @@ from ce_gym.model.options import check_fields
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.ground_clearance import GroundClearance
-from ce_gym.sim.interruptible_runs import longest_run, run_substeps
+from ce_gym.sim.interruptible_runs import is_long, run_substeps
 from ce_gym.sim.scene import resolve_scene
 from ce_gym.sim.schema import Row, Steps, physics_rows
 from ce_gym.sim.substeps import COMMAND, CONTROLLER, load_step_kernel
@@ -225,7 +225,7 @@ class Simulator:
 
     def _advance(self, given: dict[str, Array], n_substeps: int) -> None:
         """Step all robots; if Ctrl-C interrupts a long call, restore the state before."""
-        keep = n_substeps > longest_run(self.num_envs)
+        keep = is_long(n_substeps)
         before = {name: self._device.copy(array) for name, array in self._arrays.items()} if keep else {}
         arrays = self._arrays | self._batch.tables | given
         try:

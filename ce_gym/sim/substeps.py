@@ -24,8 +24,15 @@ from ce_gym.dynamics.stepping.ground_lookup import (
     planes_function,
     touching_function,
 )
-from ce_gym.dynamics.stepping.trace import NEAR, combination_function, iteration_function, step_function
-from ce_gym.dynamics.stepping.variables import UNFINISHED, StepVariables
+from ce_gym.dynamics.stepping.trace import (
+    NEAR,
+    balance_function,
+    combination_function,
+    conserve_function,
+    iteration_function,
+    step_function,
+)
+from ce_gym.dynamics.stepping.variables import BALANCE, UNFINISHED, StepVariables
 from ce_gym.model.mechanism import Mechanism
 from ce_gym.sim.calls import NONE, assign, call
 from ce_gym.sim.devices import Cpu, Device
@@ -75,18 +82,21 @@ def load_step_kernel(
         buffers += [Buffer(COMMAND if controlled else "target", joints, "rows_in")] if joints else []
         if controlled:
             buffers.append(Buffer("target", joints, "scratch"))
-            steps = tuple(_controlled(step, joints) if isinstance(step, Repeat) else step for step in steps)
+            steps = _controlled(steps, joints)
         return (Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps),)
 
     key = f"step {model_key(model)} {options!r} {laws_key(model.mechanism, options)} {outputs!r} {controlled}"
     return (device or Cpu()).kernel(key, build, dtype)
 
 
-def _controlled(substep: Repeat, size: int) -> Repeat:
-    """Return a sub-step that begins with a call of the controller, which finds the command in the target."""
+def _controlled(steps: tuple[Step | Repeat, ...], size: int) -> tuple[Repeat]:
+    """Return sub-steps that each begin with a call of the controller, as if each was a call of the kernel."""
+    *begin, substep = steps
+    assert isinstance(substep, Repeat)
     command = SX.sym(COMMAND, size)
     copy = call(traced("copy", {COMMAND: command}, {"target": command}))
-    return replace(substep, calls=(copy, Foreign(CONTROLLER, ("q", "v", "target")), *substep.calls))
+    controller = Foreign(CONTROLLER, ("q", "v", "target"))
+    return (replace(substep, calls=(*begin, copy, controller, *substep.calls)),)
 
 
 def substeps(
@@ -102,10 +112,10 @@ def substeps(
     options, plan = replace(options, dt=None), METHODS[options.method]
     step = StepVariables(mechanism, options, outputs)
     if step.stages:
-        function = iteration_function(mechanism, options, step.evaluated, chooses=has_broad_phase(options))
+        function = iteration_function(mechanism, options, step.evaluated, False, has_broad_phase(options), False)
     else:
         function = step_function(mechanism, options, step.evaluated)
-    computed = (*ITERATES, "ground", "region_points")
+    computed = (*ITERATES, BALANCE, "ground", "region_points")
     sizes = {name: function.numel_in(name) for name in function.name_in() if name not in computed}
     sizes |= {"retries": 1, **step.outputs} | ({FRAME: 3} if "ground" in function.name_in() else {})
     sizes |= step_size.control_sizes(mechanism.robot.layout) if plan.controlled else {}
@@ -114,6 +124,7 @@ def substeps(
     begin = call((step_size if plan.controlled else halving).begin_function(step))
     stages = _stages if step.stages else _one_call
     tries = (*stages(mechanism, options, step, function), *_accept(mechanism, options, step))
+    clear += [call(balance_function(mechanism, options))] if step.stages else []
     steps = (*clear, Repeat(TIMES, (begin, While(UNFINISHED.name, tries))))
     buffers = scratch_buffers(steps, sizes)
     return sizes, buffers + ([Buffer(HEIGHTS, 0, "table")] if FRAME in sizes else []), steps
@@ -146,6 +157,7 @@ def _stages(
         yield from [replace(first, only_if=UNCONVERGED, again=iterates)] * step.iterations[stage.name]
         if in_range:
             yield _clear(iteration, NEAR_ITERATE, only_if=in_range)
+        yield call(conserve_function(mechanism, options), {**end.names, DT: end.dt.name}, end.names)
     if not plan.single:
         yield call(combination_function(mechanism, options, step), {DT: step.tried.dt.name}, step.tried.names)
 

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.algebra.integration import advance
+from ce_gym.dynamics.algebra.integration import integrate
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.model import Robot
 from ce_gym.model.mechanism import LEVELS
@@ -15,7 +15,7 @@ from ce_gym.model.mechanism import LEVELS
 def move(model: Model, q: np.ndarray, v: np.ndarray, vdot: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
     """Half a step of velocity, a step of position, half a step of velocity: second order, for finite differences."""
     symbols = [SX.sym("q", model.nq), SX.sym("v", model.nv), SX.sym("a", model.nv)]
-    q1, _ = advance(symbols[0], symbols[1], SX(model.nv, 1), dt, model.robot.layout)
+    q1 = integrate(symbols[0], dt * symbols[1], model.robot.layout)
     step = ca.Function("step", symbols[:2], [q1])
     return step(q, v).full().ravel(), v + dt * vdot
 

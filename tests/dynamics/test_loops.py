@@ -11,7 +11,7 @@ from facts import robot_from_facts
 from linkages import four_bar, link, rod_leg, spatial_four_bar
 
 from ce_gym.dynamics import Model
-from ce_gym.dynamics.algebra.integration import advance
+from ce_gym.dynamics.algebra.integration import integrate
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.constraints.closure import closures
 from ce_gym.model import (
@@ -72,9 +72,7 @@ def test_power_balance(model: Model, level: str):
     tau = np.random.default_rng(8).normal(0, 5, model.nv)
     vdot = model.forward_dynamics(q, v, tau)
     symbols = SX.sym("q", model.nq), SX.sym("v", model.nv), SX.sym("dt")
-    move = ca.Function(
-        "move", symbols, [advance(symbols[0], symbols[1], SX(model.nv, 1), symbols[2], model.robot.layout)[0]]
-    )
+    move = ca.Function("move", symbols, [integrate(symbols[0], symbols[2] * symbols[1], model.robot.layout)])
     h = 1e-6
     energies = [sum(model.energy(move(q, v, dt).full().ravel(), v + dt * vdot)) for dt in (h, -h)]
     power = (energies[0] - energies[1]) / (2 * h)
@@ -150,9 +148,7 @@ def test_wrench_is_the_force_it_says(model: Model):
     body = model.body_names[-1]
     i, h, force = model.body_names.index(body), 1e-6, np.array([1.0, -2.0, 3.0])
     symbols = SX.sym("q", model.nq), SX.sym("v", model.nv), SX.sym("dt")
-    move = ca.Function(
-        "move", symbols, [advance(symbols[0], symbols[1], SX(model.nv, 1), symbols[2], model.robot.layout)[0]]
-    )
+    move = ca.Function("move", symbols, [integrate(symbols[0], symbols[2] * symbols[1], model.robot.layout)])
     points = [model.body_poses(move(q, v, dt).full().ravel())[0][i] for dt in (h, -h)]
     at = model.body_poses(q)[0][i]
     wrench = np.concatenate([np.cross(at, force), force])

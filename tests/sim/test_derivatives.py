@@ -147,7 +147,7 @@ def test_linearize_gives_the_rows_of_the_reverse_mode(robot: str, options: dict)
     target = rng.normal(0, 1, (11, len(sim.target_names)))
     derivatives = StepDerivatives(sim)
     ours, theirs = (np.dstack(both) for both in (derivatives.linearize(target), derivatives._linearize_by_rows(target)))
-    assert errors(ours, theirs).max() < (1e-4 if sim.dtype == "float32" else 1e-12)
+    assert errors(ours, theirs).max() < (1e-4 if sim.dtype == "float32" else 1e-11)
 
 
 def test_backward_through_steps_in_contact():
@@ -158,7 +158,7 @@ def test_backward_through_steps_in_contact():
     theirs, center = weighted_differences(sim, target, weights, sizes, 5)
     derivatives.step(target, 5)
     assert derivatives.n_recorded == 5
-    np.testing.assert_array_equal(sim.q, center[0])
+    np.testing.assert_allclose(sim.q, center[0], rtol=0, atol=1e-12)  # in five calls instead of one
     start = derivatives._records[0].arrays["load"]
     state, targets, _ = derivatives.backward(weights)
     ours = state | {"target": sum(targets)}
@@ -201,7 +201,7 @@ def chained(derivatives: StepDerivatives, target: np.ndarray, n_substeps: int) -
     whole, part = np.eye(sum(derivatives.state_sizes.values())), np.eye(2 * nv)
     for _ in range(n_substeps):
         A, B = derivatives.linearize(target, whole_state=True)
-        assert errors(np.dstack([A, B]), np.dstack(derivatives._linearize_by_rows(target, True))).max() < 1e-12
+        assert errors(np.dstack([A, B]), np.dstack(derivatives._linearize_by_rows(target, True))).max() < 1e-11
         whole, part = A @ whole, A[:, : 2 * nv, : 2 * nv] @ part
         sim.step(target)
     return whole, part

@@ -157,7 +157,7 @@ def test_an_integrator(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(METHODS, "third", THIRD_ORDER)
     exact = swing("rk4", 1e-4)
     errors = [np.linalg.norm(swing("third", dt) - exact) for dt in (0.002, 0.001)]
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(3, abs=0.4)
+    assert np.log2(errors[0] / errors[1]) > 2.6
 
 
 def test_a_changed_law_is_compiled_anew(monkeypatch: pytest.MonkeyPatch):

@@ -1,8 +1,7 @@
-"""Semi-implicit update of positions and velocities from accelerations.
+"""Update of positions from velocities and accelerations, and the tangent space of positions.
 
-Velocities first, then positions with the new velocities. The base's linear momentum is integrated in the world frame,
-so that free flight is a straight line at any spin. Orientations of the base and of ball joints move by the exponential
-map, and quaternions are scaled back to unit length.
+The base moves in the axes of the world, so that free flight is a straight line at any spin. Orientations of the base
+and of ball joints move by the exponential map, and quaternions are scaled back to unit length.
 """
 
 from __future__ import annotations
@@ -13,17 +12,19 @@ from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_product, quate
 from ce_gym.model.coordinates import Layout
 
 
-def advance(q: SX, v: SX, vdot: SX, dt: float, layout: Layout) -> tuple[SX, SX]:
-    """Return positions (nq,) and velocities (nv,) after a step of length `dt` [s] with constant acceleration."""
-    v_next = v + dt * vdot
-    turned = [rotate_quaternion(q[i : i + 4], v_next[j : j + 3] * dt) for i, j in layout.turns]
-    y_next = q[layout.joints_q :] + dt * v_next[layout.joints_v :]
+def advance(q: SX, v: SX, vdot: SX, dt: float, layout: Layout, share: SX) -> SX:
+    """Return positions (nq,) after a step of length `dt` [s] with constant acceleration.
+
+    Each position moves at its velocity at the start of the step plus a share of the change, shape (nv,); the base moves
+    so in the axes of the world.
+    """
+    moving = v + dt * share * vdot
+    turned = [rotate_quaternion(q[i : i + 4], moving[j : j + 3] * dt) for i, j in layout.turns]
+    y_next = q[layout.joints_q :] + dt * moving[layout.joints_v :]
     if not layout.floating:
-        return ca.vertcat(*turned, y_next), v_next
-    w, u = v[:3], v[3:6]
-    u_world = quaternion_to_rotation(q[3:7]) @ (u + dt * (vdot[3:6] + cross(w, u)))
-    v_next[3:6] = quaternion_to_rotation(turned[0]).T @ u_world
-    return ca.vertcat(q[:3] + dt * u_world, *turned, y_next), v_next
+        return ca.vertcat(*turned, y_next)
+    u_world = quaternion_to_rotation(q[3:7]) @ (moving[3:6] + dt * share[3:6] * cross(v[:3], v[3:6]))
+    return ca.vertcat(q[:3] + dt * u_world, *turned, y_next)
 
 
 def integrate(q: SX, tangent: SX, layout: Layout) -> SX:

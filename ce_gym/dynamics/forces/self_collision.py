@@ -37,7 +37,6 @@ from ce_gym.dynamics.recursion.ce_aba import (
     gravity_acceleration,
     outward_acceleration_pass,
 )
-from ce_gym.dynamics.recursion.gyroscopic import solve_turning
 from ce_gym.dynamics.recursion.kinematics import BodyState, Kinematics, constant
 from ce_gym.dynamics.standing import Standing, standing_pose
 from ce_gym.model.checks.collisions import capsules_of, separate_links
@@ -213,7 +212,6 @@ def solve_pair_forces(
     mechanism: Mechanism,
     kinematics: Kinematics,
     articulation: Articulation,
-    momentum: SX | None,
     pairs: Sequence[LinearPair],
     forces: SX,
 ) -> tuple[SX, dict[str, SX]]:
@@ -228,7 +226,6 @@ def solve_pair_forces(
         mechanism: The mechanism.
         kinematics: From the outward velocity pass.
         articulation: From the inward pass, in terms of the forces.
-        momentum: Of a floating base, see `turning_momentum`, if there is a step.
         pairs: About an iterate.
         forces: Symbols of their forces, shape (n_pairs,).
     """
@@ -242,9 +239,7 @@ def solve_pair_forces(
     if articulation.base is not None:
         inertia, (Y, wrench) = articulation.base[0], _apart(articulation.base[1], forces)
         wrenches = ca.horzcat(Y, wrench)
-        at_once = momentum is None
-        of_base = solve_positive_definite(inertia, wrenches) if at_once else solve_turning(inertia, momentum, wrenches)
-        gains += Y.T @ of_base
+        gains += Y.T @ solve_positive_definite(inertia, wrenches)
     W, free_gains = gains[:, :n], gains[:, n]
     start = [pair.normal_after(_normal(pair.law.dt * free_gains[i])) for i, pair in enumerate(pairs)]
     slopes = ca.vertcat(*[pair.law.dt * pair.normal_slope for pair in pairs])
@@ -252,7 +247,7 @@ def solve_pair_forces(
     acting.u = {k: where(near, u + Y @ pressed, u) for k, (Y, u) in left.items()}
     if articulation.base is not None:
         acting.base = inertia, where(near, wrench + Y @ pressed, wrench)
-    return outward_acceleration_pass(mechanism, kinematics, acting, momentum)
+    return outward_acceleration_pass(mechanism, kinematics, acting)
 
 
 def _apart(u: SX, forces: SX) -> tuple[SX, SX]:

@@ -35,7 +35,7 @@ from ce_gym.dynamics.algebra.spatial import (
     turning_force,
 )
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
-from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, solve_turning
+from ce_gym.dynamics.recursion.gyroscopic import TurningDamping
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free
 from ce_gym.dynamics.recursion.rotors import diagonal_bias, transverse_inertia
 from ce_gym.dynamics.recursion.stretched import Stretched, stretches
@@ -170,7 +170,7 @@ def _add_transverse_inertias(
 
 
 def outward_acceleration_pass(
-    mechanism: Mechanism, kinematics: Kinematics, articulation: Articulation, momentum: SX | None = None
+    mechanism: Mechanism, kinematics: Kinematics, articulation: Articulation
 ) -> tuple[SX, dict[str, SX]]:
     """Compute accelerations, base to tip (paper Alg. 1, outward pass 2, without its misprint).
 
@@ -178,7 +178,6 @@ def outward_acceleration_pass(
         mechanism: The mechanism.
         kinematics: From the outward velocity pass.
         articulation: From the inward pass.
-        momentum: Momentum of a floating base, see `turning_momentum`, if there is a step.
 
     Returns:
         vdot, shape (nv,), in the coordinates of `v`; and the acceleration of every body *minus gravity*, body
@@ -192,9 +191,7 @@ def outward_acceleration_pass(
         if is_free(mechanism, cluster):
             base = cluster.bodies[0]
             inertia, force = articulation.base  # type: ignore[misc]
-            a[base] = (
-                solve_positive_definite(inertia, force) if momentum is None else solve_turning(inertia, momentum, force)
-            )
+            a[base] = solve_positive_definite(inertia, force)
             state = kinematics.bodies[base]
             vdot[rows] = a[base] + ca.vertcat(SX(3, 1), state.R.T @ gravity - cross(state.v[:3], state.v[3:]))
             continue

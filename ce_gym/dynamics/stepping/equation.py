@@ -17,15 +17,15 @@ from typing import TypeAlias
 import casadi as ca
 
 from ce_gym.dynamics.algebra.integration import tangent_basis
-from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_to_rotation, skew
+from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_to_rotation
 from ce_gym.dynamics.forces.contact import LinearContact
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.laws.contacts import with_contacts
 from ce_gym.dynamics.laws.scene_laws import iterate_size
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms, inward_inertia_pass
 from ce_gym.dynamics.recursion.ce_rnea import force_on_coordinates, inward_force_pass, net_forces, outward_acceleration
-from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, turning_momentum
-from ce_gym.dynamics.stepping.step import finish_step, first_loads, linearise, stacked
+from ce_gym.dynamics.recursion.gyroscopic import TurningDamping
+from ce_gym.dynamics.stepping.step import finish_step, finished, first_loads, linearise, stacked
 from ce_gym.dynamics.stepping.trace import Given
 from ce_gym.model.mechanism import Mechanism
 
@@ -193,9 +193,6 @@ class Equation:
             f[name] = f[name] - terms.force
         left = inward_force_pass(self.mechanism, kinematics, self.a, f, self.qdd)
         left += self.system.joints.slope @ self.vdot - self.system.joints.tau
-        momentum = turning_momentum(self.mechanism, self.given.state.v, self.given.dt)
-        if momentum is not None:
-            left[:3] -= skew(momentum) @ self.vdot[:3]
         for k, rows in self.turned.items():
             left[rows] += self._damping(k, self.inertia[k])
         return left
@@ -224,7 +221,7 @@ class Equation:
     @cached_property
     def end_values(self) -> SX:
         """The state after the step at the given acceleration."""
-        after = finish_step(self.solved).state
+        after = finished(finish_step(self.solved)).state
         return ca.vertcat(after.q, after.v, *[after[name] for name in self.remembered])
 
     def tangent_after(self, columns: SX) -> SX:

@@ -25,12 +25,13 @@ from functools import cached_property, reduce
 import casadi as ca
 
 from ce_gym.dynamics.algebra.integration import advance
-from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.contact import LinearContact
+from ce_gym.dynamics.algebra.spatial import SX, cross
+from ce_gym.dynamics.forces.contact import LinearContact, where
 from ce_gym.dynamics.forces.dry_friction import stand_still
 from ce_gym.dynamics.forces.linear import JointForce, Motion, is_moment
 from ce_gym.dynamics.forces.scene import Scene, contact_places
 from ce_gym.dynamics.forces.self_collision import add_pair_forces, solve_pair_forces
+from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.laws.scene_laws import iterate_size, scene_laws
 from ce_gym.dynamics.recursion.ce_aba import (
@@ -42,10 +43,12 @@ from ce_gym.dynamics.recursion.ce_aba import (
     outward_acceleration_pass,
 )
 from ce_gym.dynamics.recursion.derived import guessed_coordinates
-from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, steadying_couples, turning_momentum
+from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, steadying_couples
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.dynamics.state import State
 from ce_gym.dynamics.stepping.broad_phase import any_in_range
+from ce_gym.dynamics.stepping.conservation import Balance, conserving_velocity
+from ce_gym.model.mechanism import Mechanism
 
 
 @dataclass
@@ -58,6 +61,7 @@ class System:
         forces: The force of each law for the assumed active set.
         loads: Their sums on joints and bodies.
         near: 1 if a contact that is seldom near is in range, else 0; None if all contacts always act.
+        pushed: Whether a law other than contacts acts on bodies.
     """
 
     start: Start
@@ -65,11 +69,20 @@ class System:
     forces: Sequence[LinearForce]
     loads: Loads
     near: SX | None
+    pushed: bool
 
     @property
     def contacts(self) -> list[LinearContact]:
         """Forces on points of bodies."""
         return [contact for force in self.forces for contact in force.contacts]
+
+    @property
+    def touching(self) -> SX:
+        """1 if a contact with the ground or between links, or another force on a body, acts, else 0."""
+        if self.pushed:
+            return SX(1)
+        acting = [where(contact.law.near, contact.active) for contact in (*self.contacts, *self.loads.pairs)]
+        return ca.sum1(ca.vertcat(*acting)) > 0 if acting else SX(0)
 
     @property
     def joints(self) -> JointTerms:
@@ -121,6 +134,7 @@ class Stepped:
         unconverged: 1 if the accelerations contradict the assumed active set, else 0.
         iterate: For the next iteration; once converged, a fixed point.
         error: Estimate of the error of the step in `v` [rad/s or m/s]; 0 for a method that has none.
+        balance: Momentum and energy that the velocities of the state do not have yet, see `conserved`; None if they do.
     """
 
     state: State
@@ -128,6 +142,7 @@ class Stepped:
     unconverged: SX
     iterate: SX
     error: SX
+    balance: Balance | None = None
 
     @cached_property
     def _sources(self) -> dict[str, LinearForce]:
@@ -157,9 +172,12 @@ def linearise(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
     parts = split(iterate, [law.size for law in laws])
     forces = [force.linearise(part) for force, part in zip(placed, parts, strict=True)]
     loads = first_loads(start)
+    pushed = False
     for force in forces:
+        before = dict(loads.bodies)
         force.add_to(loads)
-    return System(start, laws, forces, loads, near)
+        pushed = pushed or (loads.bodies != before and not force.contacts)
+    return System(start, laws, forces, loads, near, pushed)
 
 
 def cull(placed: Sequence[PlacedForce], dt: float) -> SX:
@@ -187,37 +205,109 @@ def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Sol
     """Find the acceleration of one robot over a step by CE-ABA; arguments as for `linearise`."""
     system, mechanism = linearise(scene, state, target, dt, iterate), scene.mechanism
     kinematics, loads = system.start.kinematics, system.loads
-    # implicit parts of the gyroscopic torque of the base, and of the Coriolis forces of its joints
-    momentum = None if is_moment(dt) else turning_momentum(mechanism, state.v, dt)
     turning = None if is_moment(dt) else TurningDamping(state.v, dt)
     forces = SX.sym("forces", len(loads.pairs))  # the recursion is linear in them, and is solved for them
     external = add_pair_forces(loads.bodies, loads.pairs, forces)
     articulation = inward_inertia_pass(mechanism, kinematics, system.joints, external, turning)
     if loads.pairs:
-        vdot, a = solve_pair_forces(mechanism, kinematics, articulation, momentum, loads.pairs, forces)
+        vdot, a = solve_pair_forces(mechanism, kinematics, articulation, loads.pairs, forces)
     else:
-        vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation, momentum)
+        vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation)
     return system.solved(vdot, a, articulation)
 
 
-def iteration(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Stepped:
-    """Make one iteration of a linearly implicit Euler step; arguments as for `linearise`."""
-    return finish_step(solve(scene, state, target, dt, iterate))
+def iteration(
+    scene: Scene, state: State, target: SX, dt: float, iterate: SX, balance: Balance | None = None
+) -> Stepped:
+    """Make one iteration of a linearly implicit Euler step; arguments as for `linearise` and `finish_step`."""
+    return finish_step(solve(scene, state, target, dt, iterate), balance)
 
 
-def finish_step(solved: Solved) -> Stepped:
-    """Return a robot after a step whose acceleration is known."""
+def finish_step(solved: Solved, balance: Balance | None = None) -> Stepped:
+    """Return a robot after a step whose acceleration is known, up to the velocities that `finished` corrects.
+
+    Args:
+        solved: Forces and accelerations over the step.
+        balance: Momentum and energy at the start of the step, if known.
+    """
     start, forces, motion = solved.system.start, solved.system.forces, solved.motion
     mechanism, kinematics, dt = start.scene.mechanism, start.kinematics, start.dt
-    q, v = advance(start.state.q, start.state.v, solved.vdot, dt, mechanism.robot.layout)
+    share = moving_share(solved.system)
+    q = advance(start.state.q, start.state.v, solved.vdot, dt, mechanism.robot.layout, share)
+    v = start.state.v + dt * solved.vdot
     sticks = [stick for force in forces for stick in force.sticks]
     stand_still(mechanism, kinematics, sticks, start.state.q, q, v, dt)  # changes q and v
-    memory = {"dependent": guessed_coordinates(kinematics, solved.vdot, dt)}
+    memory = {"dependent": guessed_coordinates(kinematics, share * solved.vdot, dt)}
     for force in forces:
         memory |= force.advance(motion)
     unconverged = any_check(forces, motion)
     iterate = stacked([force.next_iterate(motion, unconverged) for force in forces])
-    return Stepped(start.state.replaced(q=q, v=v, **memory), solved, unconverged, iterate, error=SX(0))
+    after = start.state.replaced(q=q, v=v, **memory)
+    balance = None if is_moment(dt) else balance_after(solved, balance)
+    return Stepped(after, solved, unconverged, iterate, error=SX(0), balance=balance)
+
+
+def moving_share(system: System) -> SX:
+    """Return for each velocity the share of its change in a step with which positions move, shape (nv,).
+
+    Free motion moves at the mean velocity of the step, share 1/2, which is accurate to second order. Forces that are
+    taken one step ahead need the velocity at the end, share 1: contacts and springs would bounce otherwise. Methods
+    that extrapolate Euler steps need the same share at all times.
+    """
+    slope = ca.diag(system.joints.slope)
+    if not METHODS[system.start.scene.options.method].is_euler:
+        return SX.ones(slope.numel())
+    return ca.if_else(system.touching, 1, ca.if_else(slope == 0, 0.5, 1))
+
+
+def balance_after(solved: Solved, before: Balance | None) -> Balance:
+    """Return the momentum, and the energy if nothing touches the robot, that it must have after a step.
+
+    Args:
+        solved: The forces over the step.
+        before: What the robot has at the start of the step, if known.
+    """
+    start, system, vdot = solved.system.start, solved.system, solved.vdot
+    mechanism = start.scene.mechanism
+    force = system.joints.tau - system.joints.slope @ vdot
+    work = start.dt * ca.dot(start.state.v + start.dt / 2 * vdot, force)
+    balance = before or Balance.of(mechanism, start.kinematics)
+    balance = balance.pushed(mechanism, start.kinematics, external_wrenches(solved), start.dt)
+    known = ca.logic_not(system.touching) if METHODS[start.scene.options.method].is_euler else SX(0)
+    if not mechanism.robot.floating:  # gravity does work, along the path of joints that move at their mean velocity
+        slope = ca.diag(system.joints.slope)[: len(mechanism.robot.commanded) + 3 * len(mechanism.robot.balls)]
+        known = ca.logic_and(known, ca.norm_inf(ca.vertcat(SX(0), slope)) == 0)
+    return replace(balance, energy=balance.energy + work, touching=ca.logic_not(known))
+
+
+def external_wrenches(solved: Solved) -> list[tuple[str, SX]]:
+    """Return mean wrenches on bodies over a step, gravity left out: body, wrench in its axes about its origin, (6,)."""
+    system, motion = solved.system, solved.motion
+    if system.pushed:  # by laws that are no contacts
+        start, couples = system.start, {}
+        if not is_moment(start.dt):  # between two bodies of the robot
+            couples = steadying_couples(start.scene.mechanism, start.kinematics, start.dt)
+        forces = {name: terms.force - terms.inertia @ motion.a[name] for name, terms in system.loads.bodies.items()}
+        return [(name, force - ca.vertcat(couples.get(name, SX(3, 1)), SX(3, 1))) for name, force in forces.items()]
+    wrenches = []
+    for contact in system.contacts:
+        force = where(contact.law.near, contact.force_after(contact.gain(motion)))
+        wrenches.append((contact.body, ca.vertcat(cross(contact.law.touch.point, force), force)))
+    return wrenches
+
+
+def conserved(mechanism: Mechanism, state: State, balance: Balance) -> State:
+    """Return a state with the velocities that a balance asks for."""
+    return state.replaced(v=conserving_velocity(mechanism, state.q, state.v, state.dependent, balance)[0])
+
+
+def finished(stepped: Stepped) -> Stepped:
+    """Return a step whose velocities have their momentum and energy."""
+    if stepped.balance is None:
+        return stepped
+    return replace(
+        stepped, state=conserved(stepped.solved.system.start.scene.mechanism, stepped.state, stepped.balance)
+    )
 
 
 def any_check(forces: Sequence[LinearForce], motion: Motion) -> SX:

@@ -20,9 +20,10 @@ from ce_gym.dynamics.laws.scene_parameters import make_scene, parameter_defaults
 from ce_gym.dynamics.recursion.derived import kinetic_and_potential, loop_gap, loop_state
 from ce_gym.dynamics.recursion.kinematics import Kinematics, outward_velocity_pass
 from ce_gym.dynamics.state import State
-from ce_gym.dynamics.stepping.step import Stepped, iteration, stacked
+from ce_gym.dynamics.stepping.conservation import Balance, balance_size, combined_balance, conserving_velocity
+from ce_gym.dynamics.stepping.step import Stepped, finished, iteration, stacked
 from ce_gym.dynamics.stepping.unroll import unrolled
-from ce_gym.dynamics.stepping.variables import StepVariables
+from ce_gym.dynamics.stepping.variables import BALANCE, StepVariables
 from ce_gym.model.mechanism import Mechanism
 
 LOST_LOOP = 1e-5
@@ -66,6 +67,7 @@ def iteration_function(
     outputs: tuple[str, ...] = (),
     follows: bool = False,
     chooses: bool = False,
+    conserves: bool = True,
 ) -> ca.Function:
     """Trace one iteration of an Euler step: repeated on its own iterate until it has converged, it makes the step.
 
@@ -76,6 +78,8 @@ def iteration_function(
         follows: See `step_function`.
         chooses: Whether contacts that are seldom near are left out where none is in range. The output `NEAR` is then 1
             if one is in range, else 0, and `near_iterate` holds the part of the iterate of these contacts.
+        conserves: Whether the velocities have their momentum and energy; if not, the output `BALANCE` is for
+            `conserve_function`.
 
     Returns:
         Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
@@ -89,11 +93,44 @@ def iteration_function(
     for name, part in parts.items():
         iterate[rows[name]] = part
     given.scene = replace(given.scene, choosing=chooses)
-    stepped = iteration(given.scene, given.state, given.target, given.dt, iterate)
-    told = {name: given.output(name, {AFTER: 1.0}, {AFTER: stepped}) for name in outputs}
+    symbol = SX.sym(BALANCE, 0 if conserves else balance_size(mechanism))
+    balance = None if conserves else Balance.from_column(symbol)
+    stepped = iteration(given.scene, given.state, given.target, given.dt, iterate, balance)
+    end = finished(stepped)
+    of_end = {name: end if conserves or name == "energy" else stepped for name in outputs}
+    told = {name: given.output(name, {AFTER: 1.0}, {AFTER: part}) for name, part in of_end.items()}
+    if conserves:
+        stepped = end
+    elif stepped.balance is not None:
+        told[BALANCE] = stepped.balance.column
+        parts[BALANCE] = symbol
     left = {f"{name}_next": stepped.iterate[of] for name, of in rows.items()} | {"unconverged": stepped.unconverged}
     left |= {} if stepped.solved.system.near is None else {NEAR: stepped.solved.system.near}
     return traced("iteration", given.inputs() | parts, given.guarded(stepped) | left | told)
+
+
+def conserve_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+    """Trace the velocities after a stage from its momentum and energy; a robot that has diverged keeps its own.
+
+    Returns:
+        Function (q, v, dependent, diverged, parameters, dt, balance) -> (v, balance); and `MOVED`, if the stage is the
+        whole step.
+    """
+    given, column = Given(mechanism, options), SX.sym(BALANCE, balance_size(mechanism))
+    state, balance = given.state, Balance.from_column(column)
+    v, balance = conserving_velocity(given.scene.mechanism, state.q, state.v, state.dependent, balance)
+    results = {"v_next": ca.if_else(given.diverged, state.v, v), f"{BALANCE}_next": balance.column}
+    if METHODS[options.method].single:
+        results[MOVED] = furthest(mechanism, results["v_next"], given.dt)
+    return traced("conserve", _needed(given.inputs() | {BALANCE: column}, results), results)
+
+
+def balance_function(mechanism: Mechanism, options: StepOptions) -> ca.Function:
+    """Trace the momentum and energy of a state: (q, v, dependent, parameters) -> (balance)."""
+    given = Given(mechanism, options)
+    kinematics = outward_velocity_pass(given.scene.mechanism, given.state.q, given.state.v, given.state.dependent)
+    results = {BALANCE: Balance.of(given.scene.mechanism, kinematics).column}
+    return traced(BALANCE, _needed(given.inputs(), results), results)
 
 
 def combination_function(mechanism: Mechanism, options: StepOptions, step: StepVariables) -> ca.Function:
@@ -109,18 +146,24 @@ def combination_function(mechanism: Mechanism, options: StepOptions, step: StepV
         their variables. Only variables of the stages that are needed are inputs. A robot that diverges in one of the
         stages keeps its state.
     """
-    plan, before = METHODS[options.method], symbolic_state(mechanism, options)
+    plan, whole = METHODS[options.method], Given(mechanism, options)
+    before = whole.state
     ends = {stage.name: symbolic_state(mechanism, options) for stage in plan.stages}
     flags = {"diverged": SX.sym("diverged")}
     flags |= {step.stages[name]["diverged"].name: SX.sym(name) for name in ends}
-    given = dict(before.items()) | flags
+    given = dict(before.items()) | flags | {"parameters": whole.parameters}
     for stage, end in ends.items():
         given |= step.stages[stage].named(dict(end.items()))
     layout = mechanism.robot.layout
+    columns = {stage: step.stages[stage][BALANCE].symbol() for stage in ends}
+    given |= {step.stages[stage][BALANCE].name: column for stage, column in columns.items()}
+    balance = combined_balance(plan, {stage: Balance.from_column(column) for stage, column in columns.items()})
     after = combined(plan, ends, layout)
+    v, balance = conserving_velocity(whole.scene.mechanism, after.q, after.v, after.dependent, balance)
+    after = after.replaced(v=v)
     sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
     results = {name: ca.if_else(sane, after[name], value) for name, value in before.items()}
-    results["diverged"] = ca.if_else(sane, 0, 1)
+    results |= {"diverged": ca.if_else(sane, 0, 1), BALANCE: balance.column}
     for name in step.tried:
         if name in results:
             continue

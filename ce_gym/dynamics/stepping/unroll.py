@@ -17,9 +17,13 @@ from ce_gym.dynamics.integrators.plan import AFTER, Plan, Rates, combined, error
 from ce_gym.dynamics.laws.scene_laws import iterations_needed
 from ce_gym.dynamics.recursion.derived import guessed_coordinates
 from ce_gym.dynamics.state import State
+from ce_gym.dynamics.stepping.conservation import Balance, combined_balance
 from ce_gym.dynamics.stepping.step import (
     Solved,
     Stepped,
+    conserved,
+    external_wrenches,
+    finished,
     first_iterate,
     iteration,
     looked_up_from,
@@ -56,9 +60,14 @@ def unrolled(plan: Plan, scene: Scene, before: State, target: SX, dt: float) -> 
     if isinstance(plan.end, Rates):
         moved = _moved(plan.end, before, list(parts.values()), dt, layout)
         integrated = {name: moved[name] for name in ("q", "v", "dependent", *rates_of(first.solved))}
-        after = first.state.replaced(**integrated)
+        after = conserved(
+            scene.mechanism, first.state.replaced(**integrated), _balance(plan.end, list(parts.values()), dt)
+        )
     else:
         after = combined(plan, {name: part.state for name, part in parts.items()}, layout)
+        if not plan.single:
+            balances = {name: part.balance for name, part in parts.items()}
+            after = conserved(scene.mechanism, after, combined_balance(plan, balances))
     error = error_estimate(plan, {name: part.state for name, part in parts.items()})
     return parts | {AFTER: replace(first, state=after, error=error)}
 
@@ -74,6 +83,17 @@ def _moved(rates: Rates, before: State, parts: list[Stepped], dt: float, layout:
     return moved
 
 
+def _balance(rates: Rates, parts: list[Stepped], dt: float) -> Balance:
+    """Return the momentum after a step from the forces at its stages; the energy is left to the method."""
+    first = parts[0].solved.system.start
+    balance = Balance.of(first.scene.mechanism, first.kinematics)
+    for weight, part in zip(rates.weights, parts, strict=False):
+        if weight:
+            wrenches = external_wrenches(part.solved)
+            balance = balance.pushed(first.scene.mechanism, part.solved.kinematics, wrenches, weight * dt)
+    return replace(balance, touching=SX(1))
+
+
 def rates_of(solved: Solved) -> dict[str, SX]:
     """Return time derivatives of the fields of force laws that explicit methods integrate."""
     return {name: rate for force in solved.system.forces for name, rate in force.rates().items()}
@@ -87,7 +107,7 @@ def iterated(scene: Scene, state: State, target: SX, dt: float, most: int) -> St
         following = ca.cse(ca.densify(iteration(scene, state, target, dt, symbol).iterate))
         for _ in range(needed):
             iterate = ca.substitute(following, symbol, ca.densify(iterate))
-    return iteration(scene, state, target, dt, iterate)
+    return finished(iteration(scene, state, target, dt, iterate))
 
 
 def _flat(state: State, names: list[str], layout: Layout) -> SX:

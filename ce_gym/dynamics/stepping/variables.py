@@ -15,6 +15,7 @@ from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import MOVED, OFF
 from ce_gym.dynamics.laws.scene_laws import iterations_needed, output_sizes, state_sizes
+from ce_gym.dynamics.stepping.conservation import balance_size
 from ce_gym.model.mechanism import Mechanism
 
 T = TypeVar("T")
@@ -36,6 +37,10 @@ DT, RETRIES = Variable("dt"), Variable("retries")
 """Length of the sub-step [s]; number of tries that were rejected because of a failure or a large error."""
 LEFT, UNFINISHED = Variable("left"), Variable("unfinished")
 """Part of the sub-step that is left; whether the robot has to go on with it, 1 or 0."""
+
+
+BALANCE = "balance"
+"""Name of the momentum and energy after a stage, see `conservation.py`; only of methods that iterate."""
 
 
 class Variables(dict[str, Variable]):
@@ -96,19 +101,22 @@ class StepVariables:
         self.outputs = {name: size for name in outputs if (size := known.get(name, 1))}
         measured = {MOVED: 1} | ({OFF: mechanism.robot.layout.nv + 1} if plan.controlled else {})
         state = state_sizes(mechanism, options) | {"diverged": 1}
-        self.start = StateVariables("", state | self.outputs)
-        self.tried = StateVariables("tried", state | self.outputs | measured)
         most = iterations_needed(mechanism, options)
         self.iterations = {stage.name: min(stage.iterations, most) for stage in plan.stages}
         iterates = any(self.iterations.values())
+        balance = {BALANCE: balance_size(mechanism)} if iterates else {}
+        self.start = StateVariables("", state | self.outputs | balance)
+        self.tried = StateVariables("tried", state | self.outputs | measured | balance)
         evaluated = self.outputs | measured
-        if iterates and not plan.single:
-            evaluated = {name: size for name, size in self.outputs.items() if name != "error"}
+        if iterates:
+            evaluated = {name: size for name, size in self.outputs.items() if plan.single or name != "error"}
         self.evaluated = tuple(evaluated)
         self.stages = dict[str, StateVariables]()
         self._fractions = {self.tried.dt: 1.0}
         for stage in plan.stages if iterates else ():
-            self.stages[stage.name] = self.tried if plan.single else StateVariables(stage.name, state | evaluated)
+            self.stages[stage.name] = (
+                self.tried if plan.single else StateVariables(stage.name, state | evaluated | balance)
+            )
             self._fractions[self.stages[stage.name].dt] = stage.length
 
     def lengths(self, dt: SX) -> dict[str, SX]:

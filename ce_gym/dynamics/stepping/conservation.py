@@ -1,0 +1,302 @@
+"""Base velocity after a step from the momentum of the robot, and the energy of free flight.
+
+An Euler step integrates the velocity of the base with the Coriolis forces at the start of the step. Its angular
+momentum is wrong by a term of first order, and so is the energy: a body that tumbles gains both. Therefore a step takes
+from the recursion only the accelerations of the joints and the contact forces. Momentum is integrated exactly,
+
+    P+ = P + dt (sum f + m g),    L+ = L + dt sum (x - c) x f        (L about the centre of mass c, forces f at x),
+
+and the velocity of the base follows from the momentum and the composite inertia at the end of the step. In flight the
+momentum is constant to rounding; contacts change it by exactly their impulses.
+
+With given momentum, the kinetic energy about the centre of mass is a quadratic form in the velocities of the joints,
+
+    T = L^T I^-1 L / 2 + B(yd),    B(yd) = energy of the joints' motion with zero momentum.
+
+While nothing touches the robot, only the forces of the joints do work about the centre of mass, and this work is known:
+`dt tau^T (yd + yd+) / 2`. The velocities of the joints are scaled so that the energy after the step is the energy
+before the step plus this work. The factor differs from 1 by an error of the step. On a fixed base the potential energy
+takes part as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+
+from ce_gym.dynamics.algebra.spatial import SX, cross, mirrored, skew, solve_positive_definite
+from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
+from ce_gym.dynamics.integrators.plan import Ends, Plan
+from ce_gym.dynamics.recursion.ce_aba import gravity_acceleration
+from ce_gym.dynamics.recursion.kinematics import BodyState, Kinematics, constant, outward_velocity_pass
+from ce_gym.dynamics.recursion.rotors import transverse_inertia
+from ce_gym.model.mechanism import Mechanism
+
+LARGEST_SCALING = 0.5
+"""Largest relative change of the velocities of joints in a step to keep the energy."""
+SMALL_SHARE = 1e-3
+"""Share of the energy below which the motion of the joints is not scaled by the full error of the energy."""
+TINY = 1e-12
+"""Keeps a quotient finite [J]."""
+
+
+@dataclass
+class Composite:
+    """Mass distribution of a robot frozen in its pose.
+
+    Attributes:
+        mass: [kg].
+        moment: Mass times centre of mass, base axes [kg m], shape (3,).
+        inertia: About the origin of the base, base axes [kg m^2], shape (3, 3).
+    """
+
+    mass: SX | float
+    moment: SX
+    inertia: SX
+
+    @property
+    def center(self) -> SX:
+        """Centre of mass in base axes [m], shape (3,)."""
+        return self.moment / self.mass
+
+    @property
+    def inertia_about_center(self) -> SX:
+        """Inertia about the centre of mass, base axes [kg m^2], shape (3, 3)."""
+        return mirrored(self.inertia + skew(self.moment) @ skew(self.center))
+
+
+@dataclass
+class Momentum:
+    """Momentum and kinetic energy of a robot.
+
+    Attributes:
+        angular: About the origin of the base, base axes [kg m^2/s], shape (3,).
+        linear: Base axes [kg m/s], shape (3,).
+        energy: Kinetic energy [J].
+    """
+
+    angular: SX
+    linear: SX
+    energy: SX
+
+    def about(self, center: SX) -> SX:
+        """Return the angular momentum about a point in base axes [m]."""
+        return self.angular - cross(center, self.linear)
+
+
+def composite_of(mechanism: Mechanism, kinematics: Kinematics) -> Composite:
+    """Return the mass distribution of a floating robot."""
+    parts = {}
+    for name, body in mechanism.bodies.items():
+        moment = ca.sparsify(ca.vertcat(SX(body.inertia[2, 4]), body.inertia[0, 5], body.inertia[1, 3]))
+        parts[name] = Composite(body.inertia[3, 3], moment, constant(body.inertia[:3, :3]))
+    for rotor, row, coordinates in _rotors(mechanism, kinematics):
+        turned = transverse_inertia(rotor, coordinates.q[row], SX(0), SX(3, 1)).inertia
+        parts[rotor.carrier].inertia = parts[rotor.carrier].inertia + turned
+    for name in reversed(mechanism.bodies):
+        parent, part, X = mechanism.bodies[name].parent, parts[name], kinematics.bodies[name].X
+        if parent is None:
+            continue
+        moment, P = X.E.T @ part.moment, skew(X.p)
+        across = P @ skew(moment)
+        inertia = mirrored(mirrored(X.E.T @ part.inertia @ X.E) - across - across.T - part.mass * (P @ P))
+        total = parts[parent]
+        parts[parent] = Composite(
+            total.mass + part.mass, total.moment + moment + part.mass * X.p, mirrored(total.inertia + inertia)
+        )
+    return parts[next(iter(mechanism.bodies))]
+
+
+def momentum_of(mechanism: Mechanism, kinematics: Kinematics) -> Momentum:
+    """Return momentum and kinetic energy; of a robot on a fixed base only the energy has a meaning."""
+    momentum, energy = {}, SX(0)
+    for name, body in mechanism.bodies.items():
+        v = kinematics.bodies[name].v
+        momentum[name] = constant(body.inertia) @ v
+        energy += ca.dot(v, momentum[name]) / 2
+    for rotor, row, coordinates in _rotors(mechanism, kinematics):
+        rate, w = coordinates.qd[row], kinematics.bodies[rotor.carrier].v[:3]
+        turned = transverse_inertia(rotor, coordinates.q[row], rate, w).inertia @ w
+        spin = constant(rotor.axis) * (rotor.inertia * rate)
+        momentum[rotor.carrier] = momentum[rotor.carrier] + ca.vertcat(spin + turned, SX(3, 1))
+        energy += ca.dot(w, spin + turned / 2)
+    energy += _spin_energy(mechanism, kinematics)
+    total = SX(6, 1)
+    for name in reversed(mechanism.bodies):
+        parent = mechanism.bodies[name].parent
+        if parent is None:
+            total = momentum[name]
+        else:
+            momentum[parent] = momentum[parent] + kinematics.bodies[name].X.force_to_parent(momentum[name])
+    return Momentum(total[:3], total[3:], energy)
+
+
+def _rotors(mechanism: Mechanism, kinematics: Kinematics) -> list:
+    """Return the eliminated rotors whose momentum acts on a carrier, with their rows and coordinates."""
+    if mechanism.level in ("none", "armature", "coupled"):
+        return []
+    found = []
+    for k, rotors in enumerate(mechanism.eliminated_rotors):
+        coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
+        found += [(rotor, coordinates.index[rotor.name], coordinates) for rotor in rotors if rotor.carrier is not None]
+    return found
+
+
+def _spin_energy(mechanism: Mechanism, kinematics: Kinematics) -> SX:
+    """Return the kinetic energy of the eliminated rotors about their axes, as the level has it [J]."""
+    energy = SX(0)
+    if mechanism.level == "none":
+        return energy
+    for k, rotors in enumerate(mechanism.eliminated_rotors):
+        coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
+        for rotor in rotors:
+            row = coordinates.index[rotor.name]
+            speeds = coordinates.qd[row]
+            if mechanism.level == "armature":
+                names = mechanism.tree.clusters[k].independent
+                yd = coordinates.qd[[coordinates.index[name] for name in names]]
+                speeds = ca.vec(coordinates.G[row, :]) * yd
+            energy += rotor.inertia * ca.sumsqr(speeds) / 2
+    return energy
+
+
+def potential_energy(mechanism: Mechanism, kinematics: Kinematics) -> SX:
+    """Return the potential energy in gravity [J]."""
+    energy, gravity = SX(0), gravity_acceleration(mechanism)
+    for name, body in mechanism.bodies.items():
+        moment = ca.sparsify(ca.vertcat(SX(body.inertia[2, 4]), body.inertia[0, 5], body.inertia[1, 3]))
+        state = kinematics.bodies[name]
+        energy -= ca.dot(gravity, body.inertia[3, 3] * state.p + state.R @ moment)
+    return energy
+
+
+@dataclass
+class Balance:
+    """What a robot must have after a step: momentum, and energy if nothing touches it.
+
+    Attributes:
+        angular: Angular momentum about the centre of mass, world axes [kg m^2/s], shape (3,); (0,) on a fixed base.
+        linear: Linear momentum, world axes [kg m/s], shape (3,); (0,) on a fixed base.
+        center: Centre of mass at the start of the step, world axes [m], shape (3,); (0,) on a fixed base.
+        energy: Kinetic energy about the centre of mass; on a fixed base the kinetic and potential energy [J].
+        touching: 1 if a contact acts, so that the energy is not known; else 0.
+    """
+
+    angular: SX
+    linear: SX
+    center: SX
+    energy: SX
+    touching: SX
+
+    @staticmethod
+    def of(mechanism: Mechanism, kinematics: Kinematics) -> Balance:
+        """Return what a robot has in a state."""
+        momentum = momentum_of(mechanism, kinematics)
+        if not mechanism.robot.floating:
+            energy = momentum.energy + potential_energy(mechanism, kinematics)
+            return Balance(*[SX(0, 1)] * 3, energy, SX(0))
+        composite, base = composite_of(mechanism, kinematics), base_of(mechanism, kinematics)
+        energy = momentum.energy - ca.sumsqr(momentum.linear) / (2 * composite.mass)
+        angular, center = momentum.about(composite.center), base.point_position(composite.center)
+        return Balance(base.R @ angular, base.R @ momentum.linear, center, energy, SX(0))
+
+    def pushed(
+        self, mechanism: Mechanism, kinematics: Kinematics, wrenches: Sequence[tuple[str, SX]], duration: SX | float
+    ) -> Balance:
+        """Return the balance after wrenches on bodies and gravity have acted.
+
+        Args:
+            mechanism: The robot.
+            kinematics: Where the wrenches act.
+            wrenches: Body and wrench on it [N m; N], in its axes about its origin, shape (6,).
+            duration: Of the wrenches [s].
+        """
+        if not mechanism.robot.floating:
+            return self
+        force, torque = mass_of(mechanism) * gravity_acceleration(mechanism), SX(3, 1)
+        for name, wrench in wrenches:
+            body = kinematics.bodies[name]
+            push = body.R @ wrench[3:]
+            force, torque = force + push, torque + body.R @ wrench[:3] + cross(body.p - self.center, push)
+        return replace(self, angular=self.angular + duration * torque, linear=self.linear + duration * force)
+
+    @property
+    def column(self) -> SX:
+        """The numbers stacked, shape (`balance_size`,)."""
+        return ca.vertcat(self.angular, self.linear, self.center, self.energy, self.touching)
+
+    @staticmethod
+    def from_column(column: SX) -> Balance:
+        """Unpack a column."""
+        n = (column.numel() - 2) // 3
+        return Balance(*ca.vertsplit(column, [0, n, 2 * n, 3 * n, 3 * n + 1, 3 * n + 2]))
+
+
+def combined_balance(plan: Plan, balances: Mapping[str, Balance | None]) -> Balance:
+    """Return the weighted sum of the momenta of stages, for a plan whose `end` is `Ends`; energy is not kept."""
+    assert isinstance(plan.end, Ends)
+    columns = {name: balance.column for name, balance in balances.items() if balance is not None}
+    column = sum((weight * columns[name] for name, weight in plan.end.weights.items()), SX(0))
+    return replace(Balance.from_column(column), touching=SX(1))
+
+
+def balance_size(mechanism: Mechanism) -> int:
+    """Return the size of the column of a balance."""
+    return 11 if mechanism.robot.floating else 2
+
+
+def base_of(mechanism: Mechanism, kinematics: Kinematics) -> BodyState:
+    """Return the state of the floating base."""
+    return kinematics.bodies[next(iter(mechanism.bodies))]
+
+
+def mass_of(mechanism: Mechanism) -> SX:
+    """Return the mass of all moving bodies [kg]."""
+    return sum((body.inertia[3, 3] for body in mechanism.bodies.values()), SX(0))
+
+
+def conserving_velocity(mechanism: Mechanism, q: SX, v: SX, guess: SX, balance: Balance) -> tuple[SX, Balance]:
+    """Return the velocities (nv,) that have a given momentum and, in flight, a given energy; and what they then have.
+
+    Args:
+        mechanism: The robot.
+        q: Positions, shape (nq,).
+        v: Velocities; those of the base are ignored, those of the joints are scaled to have the energy.
+        guess: Dependent coordinates, see `outward_velocity_pass`.
+        balance: Momentum and energy.
+    """
+    n = mechanism.robot.layout.base_nv
+    kinematics = outward_velocity_pass(mechanism, q, ca.vertcat(SX(n, 1), v[n:]), guess)
+    motion = momentum_of(mechanism, kinematics)  # of the joints, with the base at rest
+    if not mechanism.robot.floating:
+        potential = potential_energy(mechanism, kinematics)
+        scale = _scaling(balance.energy - potential, motion.energy, balance.touching)
+        return scale * v, replace(balance, energy=scale**2 * motion.energy + potential, touching=SX(0))
+    composite, base = composite_of(mechanism, kinematics), base_of(mechanism, kinematics)
+    linear, angular = base.R.T @ balance.linear, base.R.T @ balance.angular
+    joints = motion.about(composite.center)
+    turning = solve_positive_definite(composite.inertia_about_center, ca.horzcat(angular, joints))
+    frozen = ca.dot(angular, turning[:, 0]) / 2
+    energy = motion.energy - ca.sumsqr(motion.linear) / (2 * composite.mass) - ca.dot(joints, turning[:, 1]) / 2
+    scale = _scaling(balance.energy - frozen, energy, balance.touching, frozen) if v.numel() > n else SX(1)
+    w = turning[:, 0] - scale * turning[:, 1]
+    u = (linear - scale * motion.linear) / composite.mass - cross(w, composite.center)
+    after = replace(balance, center=base.point_position(composite.center), touching=SX(0))
+    return ca.vertcat(w, u, scale * v[n:]), replace(after, energy=frozen + scale**2 * energy)
+
+
+def _scaling(kept: SX, energy: SX, touching: SX, other: SX | float = 0.0) -> SX:
+    """Return the factor on the velocities of joints that gives their motion the energy that is kept [J].
+
+    Args:
+        kept: Energy that the motion of the joints should have.
+        energy: Energy that it has.
+        touching: Whether a contact acts; then the factor is 1.
+        other: Energy that does not depend on this motion.
+    """
+    lowest, highest = (1 - LARGEST_SCALING) ** 2, (1 + LARGEST_SCALING) ** 2
+    square = 1 + (kept - energy) / (energy + SMALL_SHARE * other + TINY)
+    scale = ca.sqrt(ca.fmin(ca.fmax(square, lowest), highest))
+    return ca.if_else(touching, 1, scale)
