@@ -94,7 +94,8 @@ class SubStep:
     def calls(self) -> list[Call]:
         """The calls that the kernel of this sub-step repeats."""
         _, _, steps = substeps(self.model.mechanism, self.options, self.outputs)
-        return [call for call in calls_of(steps) if isinstance(call, Call)]
+        repeated = [step for step in steps if isinstance(step, Repeat)]
+        return [call for call in calls_of(repeated) if isinstance(call, Call)]
 
     @property
     def instructions(self) -> int:
