@@ -85,7 +85,7 @@ def test_contacts_change_momentum_by_their_impulse():
     assert touched > 10
 
 
-@pytest.mark.parametrize(("dt", "spin", "bound"), [(0.001, 10.0, 1e-4), (0.005, 10.0, 1e-3), (0.02, 20.0, 2e-2)])
+@pytest.mark.parametrize(("dt", "spin", "bound"), [(0.001, 10.0, 1e-4), (0.005, 10.0, 1e-3), (0.02, 20.0, 5e-2)])
 def test_free_flight_keeps_its_energy(awkward_robot, dt: float, spin: float, bound: float):
     """Passive joints, however coarse the step: neither gained nor lost."""
     sim = Simulator(Model(weightless(awkward_robot())), N, dt, control="torque", outputs=())
