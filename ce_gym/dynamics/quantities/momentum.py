@@ -1,9 +1,5 @@
 """Centre of mass and centroidal momentum, with the momentum of spinning rotors.
 
-The momentum of a robot about its centre of mass is the sum over bodies of `I v`, and for each eliminated rotor of
-`J thd` along its axis and of its transverse inertia times the velocity of its carrier, see `recursion/ce_aba.py` and
-`recursion/rotors.py`. Levels without these terms in their equations of motion have no such momentum either.
-
 Source: Orin, Goswami, Lee, "Centroidal dynamics of a humanoid robot", Autonomous Robots 35, 2013.
 """
 
@@ -15,12 +11,11 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX, cross
-from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
-from ce_gym.dynamics.quantities.frames import body_motion, rate_of_change
+from ce_gym.dynamics.quantities.frames import rate_of_change
 from ce_gym.dynamics.quantities.inputs import function_of_state, state_symbols
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
-from ce_gym.dynamics.recursion.rotors import transverse_inertia
-from ce_gym.model.mechanism import EliminatedRotor, Mechanism
+from ce_gym.dynamics.recursion.momentum import momentum_of
+from ce_gym.model.mechanism import Mechanism
 
 
 def center_of_mass(mechanism: Mechanism, kinematics: Kinematics) -> tuple[SX, SX]:
@@ -41,27 +36,12 @@ def center_of_mass(mechanism: Mechanism, kinematics: Kinematics) -> tuple[SX, SX
 def centroidal_momentum(mechanism: Mechanism, kinematics: Kinematics) -> SX:
     """Return the momentum [angular about the centre of mass; linear], world axes, shape (6,)."""
     _, center = center_of_mass(mechanism, kinematics)
-    angular, linear = SX(3, 1), SX(3, 1)
-    for name, body in mechanism.bodies.items():
-        state = kinematics.bodies[name]
-        momentum = constant(body.inertia) @ state.v
-        force = state.R @ momentum[3:]
-        angular += state.R @ momentum[:3] + cross(state.p - center, force)
-        linear += force
-    if mechanism.exact:
-        for k, rotors in enumerate(mechanism.eliminated_rotors):
-            for rotor in rotors:
-                angular += _spin_momentum(mechanism, kinematics, k, rotor)
-    return ca.vertcat(angular, linear)
-
-
-def _spin_momentum(mechanism: Mechanism, kinematics: Kinematics, k: int, rotor: EliminatedRotor) -> SX:
-    """Return the angular momentum of an eliminated rotor that its carrier's inertia leaves out, world axes, (3,)."""
-    coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
-    carrier, row = body_motion(mechanism, kinematics, rotor.carrier), coordinates.index[rotor.name]
-    angle, rate, w = coordinates.q[row], coordinates.qd[row], carrier.R.T @ carrier.w
-    transverse = transverse_inertia(rotor, angle, rate, w).inertia
-    return carrier.R @ (constant(rotor.axis) * (rotor.inertia * rate) + transverse @ w)
+    momentum = momentum_of(mechanism, kinematics)
+    if not mechanism.robot.floating:
+        return ca.vertcat(momentum.about(center), momentum.linear)
+    base = kinematics.bodies[next(iter(mechanism.bodies))]
+    angular, linear = base.R @ momentum.angular, base.R @ momentum.linear
+    return ca.vertcat(angular + cross(base.p - center, linear), linear)
 
 
 def _center_of_mass(mechanism: Mechanism) -> ca.Function:

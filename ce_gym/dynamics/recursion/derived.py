@@ -8,25 +8,16 @@ import numpy as np
 from ce_gym.dynamics.algebra.spatial import SX, cross
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.constraints.residuals import gap as constraint_gap
-from ce_gym.dynamics.recursion.ce_aba import BodyTerms, gravity_acceleration
-from ce_gym.dynamics.recursion.ce_rnea import inverse_dynamics
+from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, is_free, outward_velocity_pass
+from ce_gym.dynamics.recursion.momentum import momentum_of, potential_energy
 from ce_gym.model.mechanism import Mechanism
 
 
 def kinetic_and_potential(mechanism: Mechanism, q: SX, v: SX, guess: SX) -> tuple[SX, SX]:
     """Return kinetic and potential energy [J] of a mechanism at positions (nq,) and velocities (nv,)."""
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
-    at_rest = outward_velocity_pass(mechanism, q, SX(*v.shape), guess)
-    momentum = inverse_dynamics(mechanism, at_rest, v) - inverse_dynamics(mechanism, at_rest, SX(*v.shape))
-    potential = SX(0)
-    gravity = gravity_acceleration(mechanism)
-    for name, body in mechanism.bodies.items():
-        mass = body.inertia[3, 3]
-        moment = ca.sparsify(ca.vertcat(body.inertia[2, 4], body.inertia[0, 5], body.inertia[1, 3]))  # mass * com
-        state = kinematics.bodies[name]
-        potential -= ca.dot(gravity, mass * state.p + state.R @ moment)
-    return ca.dot(v, momentum) / 2, potential
+    return momentum_of(mechanism, kinematics).energy, potential_energy(mechanism, kinematics)
 
 
 def loop_gap(mechanism: Mechanism, kinematics: Kinematics) -> SX:

@@ -26,12 +26,11 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from ce_gym.dynamics.algebra.spatial import SX, cross, mirrored, skew, solve_positive_definite
-from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
+from ce_gym.dynamics.algebra.spatial import SX, cross, solve_positive_definite
 from ce_gym.dynamics.integrators.plan import Ends, Plan
 from ce_gym.dynamics.recursion.ce_aba import gravity_acceleration
-from ce_gym.dynamics.recursion.kinematics import BodyState, Kinematics, constant, outward_velocity_pass
-from ce_gym.dynamics.recursion.rotors import transverse_inertia
+from ce_gym.dynamics.recursion.kinematics import BodyState, Kinematics, outward_velocity_pass
+from ce_gym.dynamics.recursion.momentum import composite_of, momentum_of, potential_energy
 from ce_gym.model.mechanism import Mechanism
 
 LARGEST_SCALING = 0.5
@@ -40,136 +39,6 @@ SMALL_SHARE = 1e-3
 """Share of the energy below which the motion of the joints is not scaled by the full error of the energy."""
 TINY = 1e-12
 """Keeps a quotient finite [J]."""
-
-
-@dataclass
-class Composite:
-    """Mass distribution of a robot frozen in its pose.
-
-    Attributes:
-        mass: [kg].
-        moment: Mass times centre of mass, base axes [kg m], shape (3,).
-        inertia: About the origin of the base, base axes [kg m^2], shape (3, 3).
-    """
-
-    mass: SX | float
-    moment: SX
-    inertia: SX
-
-    @property
-    def center(self) -> SX:
-        """Centre of mass in base axes [m], shape (3,)."""
-        return self.moment / self.mass
-
-    @property
-    def inertia_about_center(self) -> SX:
-        """Inertia about the centre of mass, base axes [kg m^2], shape (3, 3)."""
-        return mirrored(self.inertia + skew(self.moment) @ skew(self.center))
-
-
-@dataclass
-class Momentum:
-    """Momentum and kinetic energy of a robot.
-
-    Attributes:
-        angular: About the origin of the base, base axes [kg m^2/s], shape (3,).
-        linear: Base axes [kg m/s], shape (3,).
-        energy: Kinetic energy [J].
-    """
-
-    angular: SX
-    linear: SX
-    energy: SX
-
-    def about(self, center: SX) -> SX:
-        """Return the angular momentum about a point in base axes [m]."""
-        return self.angular - cross(center, self.linear)
-
-
-def composite_of(mechanism: Mechanism, kinematics: Kinematics) -> Composite:
-    """Return the mass distribution of a floating robot."""
-    parts = {}
-    for name, body in mechanism.bodies.items():
-        moment = ca.sparsify(ca.vertcat(SX(body.inertia[2, 4]), body.inertia[0, 5], body.inertia[1, 3]))
-        parts[name] = Composite(body.inertia[3, 3], moment, constant(body.inertia[:3, :3]))
-    for rotor, row, coordinates in _rotors(mechanism, kinematics):
-        turned = transverse_inertia(rotor, coordinates.q[row], SX(0), SX(3, 1)).inertia
-        parts[rotor.carrier].inertia = parts[rotor.carrier].inertia + turned
-    for name in reversed(mechanism.bodies):
-        parent, part, X = mechanism.bodies[name].parent, parts[name], kinematics.bodies[name].X
-        if parent is None:
-            continue
-        moment, P = X.E.T @ part.moment, skew(X.p)
-        across = P @ skew(moment)
-        inertia = mirrored(mirrored(X.E.T @ part.inertia @ X.E) - across - across.T - part.mass * (P @ P))
-        total = parts[parent]
-        parts[parent] = Composite(
-            total.mass + part.mass, total.moment + moment + part.mass * X.p, mirrored(total.inertia + inertia)
-        )
-    return parts[next(iter(mechanism.bodies))]
-
-
-def momentum_of(mechanism: Mechanism, kinematics: Kinematics) -> Momentum:
-    """Return momentum and kinetic energy; of a robot on a fixed base only the energy has a meaning."""
-    momentum, energy = {}, SX(0)
-    for name, body in mechanism.bodies.items():
-        v = kinematics.bodies[name].v
-        momentum[name] = constant(body.inertia) @ v
-        energy += ca.dot(v, momentum[name]) / 2
-    for rotor, row, coordinates in _rotors(mechanism, kinematics):
-        rate, w = coordinates.qd[row], kinematics.bodies[rotor.carrier].v[:3]
-        turned = transverse_inertia(rotor, coordinates.q[row], rate, w).inertia @ w
-        spin = constant(rotor.axis) * (rotor.inertia * rate)
-        momentum[rotor.carrier] = momentum[rotor.carrier] + ca.vertcat(spin + turned, SX(3, 1))
-        energy += ca.dot(w, spin + turned / 2)
-    energy += _spin_energy(mechanism, kinematics)
-    total = SX(6, 1)
-    for name in reversed(mechanism.bodies):
-        parent = mechanism.bodies[name].parent
-        if parent is None:
-            total = momentum[name]
-        else:
-            momentum[parent] = momentum[parent] + kinematics.bodies[name].X.force_to_parent(momentum[name])
-    return Momentum(total[:3], total[3:], energy)
-
-
-def _rotors(mechanism: Mechanism, kinematics: Kinematics) -> list:
-    """Return the eliminated rotors whose momentum acts on a carrier, with their rows and coordinates."""
-    if mechanism.level in ("none", "armature", "coupled"):
-        return []
-    found = []
-    for k, rotors in enumerate(mechanism.eliminated_rotors):
-        coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
-        found += [(rotor, coordinates.index[rotor.name], coordinates) for rotor in rotors if rotor.carrier is not None]
-    return found
-
-
-def _spin_energy(mechanism: Mechanism, kinematics: Kinematics) -> SX:
-    """Return the kinetic energy of the eliminated rotors about their axes, as the level has it [J]."""
-    energy = SX(0)
-    if mechanism.level == "none":
-        return energy
-    for k, rotors in enumerate(mechanism.eliminated_rotors):
-        coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
-        for rotor in rotors:
-            row = coordinates.index[rotor.name]
-            speeds = coordinates.qd[row]
-            if mechanism.level == "armature":
-                names = mechanism.tree.clusters[k].independent
-                yd = coordinates.qd[[coordinates.index[name] for name in names]]
-                speeds = ca.vec(coordinates.G[row, :]) * yd
-            energy += rotor.inertia * ca.sumsqr(speeds) / 2
-    return energy
-
-
-def potential_energy(mechanism: Mechanism, kinematics: Kinematics) -> SX:
-    """Return the potential energy in gravity [J]."""
-    energy, gravity = SX(0), gravity_acceleration(mechanism)
-    for name, body in mechanism.bodies.items():
-        moment = ca.sparsify(ca.vertcat(SX(body.inertia[2, 4]), body.inertia[0, 5], body.inertia[1, 3]))
-        state = kinematics.bodies[name]
-        energy -= ca.dot(gravity, body.inertia[3, 3] * state.p + state.R @ moment)
-    return energy
 
 
 @dataclass
