@@ -26,11 +26,17 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 
-from ce_gym.dynamics.algebra.spatial import SX, cross, solve_positive_definite
+from ce_gym.dynamics.algebra.spatial import (
+    SX,
+    cross,
+    quaternion_product,
+    quaternion_to_rotation,
+    solve_positive_definite,
+)
 from ce_gym.dynamics.integrators.plan import Ends, Plan
 from ce_gym.dynamics.recursion.ce_aba import gravity_acceleration
 from ce_gym.dynamics.recursion.kinematics import BodyState, Kinematics, outward_velocity_pass
-from ce_gym.dynamics.recursion.momentum import composite_of, momentum_of, potential_energy
+from ce_gym.dynamics.recursion.momentum import Composite, composite_of, momentum_of, potential_energy
 from ce_gym.model.mechanism import Mechanism
 
 LARGEST_SCALING = 0.5
@@ -126,13 +132,13 @@ def mass_of(mechanism: Mechanism) -> SX:
     return sum((body.inertia[3, 3] for body in mechanism.bodies.values()), SX(0))
 
 
-def conserving_velocity(mechanism: Mechanism, q: SX, v: SX, guess: SX, balance: Balance) -> tuple[SX, Balance]:
-    """Return the velocities (nv,) that have a given momentum and, in flight, a given energy; and what they then have.
+def conserving_velocity(mechanism: Mechanism, q: SX, v: SX, guess: SX, balance: Balance) -> tuple[SX, SX, Balance]:
+    """Return positions and velocities that have a given momentum and, in flight, a given energy; and what they have.
 
     Args:
         mechanism: The robot.
-        q: Positions, shape (nq,).
-        v: Velocities; those of the base are ignored, those of the joints are scaled to have the energy.
+        q: Positions, shape (nq,). Only the orientation of a robot without joints changes, to have the energy.
+        v: Velocities, shape (nv,); those of the base are ignored, those of the joints are scaled to have the energy.
         guess: Dependent coordinates, see `outward_velocity_pass`.
         balance: Momentum and energy.
     """
@@ -142,18 +148,53 @@ def conserving_velocity(mechanism: Mechanism, q: SX, v: SX, guess: SX, balance: 
     if not mechanism.robot.floating:
         potential = potential_energy(mechanism, kinematics)
         scale = _scaling(balance.energy - potential, motion.energy, balance.touching)
-        return scale * v, replace(balance, energy=scale**2 * motion.energy + potential, touching=SX(0))
+        return q, scale * v, replace(balance, energy=scale**2 * motion.energy + potential, touching=SX(0))
     composite, base = composite_of(mechanism, kinematics), base_of(mechanism, kinematics)
     linear, angular = base.R.T @ balance.linear, base.R.T @ balance.angular
+    if v.numel() == n:
+        return _turned_body(q, composite, angular, balance)
     joints = motion.about(composite.center)
     turning = solve_positive_definite(composite.inertia_about_center, ca.horzcat(angular, joints))
     frozen = ca.dot(angular, turning[:, 0]) / 2
     energy = motion.energy - ca.sumsqr(motion.linear) / (2 * composite.mass) - ca.dot(joints, turning[:, 1]) / 2
-    scale = _scaling(balance.energy - frozen, energy, balance.touching, frozen) if v.numel() > n else SX(1)
+    scale = _scaling(balance.energy - frozen, energy, balance.touching, frozen)
     w = turning[:, 0] - scale * turning[:, 1]
     u = (linear - scale * motion.linear) / composite.mass - cross(w, composite.center)
     after = replace(balance, center=base.point_position(composite.center), touching=SX(0))
-    return ca.vertcat(w, u, scale * v[n:]), replace(after, energy=frozen + scale**2 * energy)
+    return q, ca.vertcat(w, u, scale * v[n:]), replace(after, energy=frozen + scale**2 * energy)
+
+
+def _turned_body(q: SX, composite: Composite, angular: SX, balance: Balance) -> tuple[SX, SX, Balance]:
+    """Return what `conserving_velocity` returns, for one rigid body.
+
+    The energy of a body depends on the direction of its angular momentum M in its axes. Energies `M^T I^-1 M / 2` along
+    `M + t d`, scaled to the length of M, with d the part of the angular velocity across M, are those of a quadratic
+    equation in t; the body is turned by the smallest rotation that takes the one direction to the other.
+
+    Args:
+        q: Position and orientation, shape (7,).
+        composite: The body.
+        angular: Angular momentum about the centre of mass, body axes [kg m^2/s], shape (3,).
+        balance: Momentum and energy.
+    """
+    inertia, square = composite.inertia_about_center, ca.sumsqr(angular) + TINY
+    w = solve_positive_definite(inertia, angular)
+    across = w - angular * (ca.dot(w, angular) / square)
+    bent = solve_positive_definite(inertia, across)
+    excess, slope = ca.dot(angular, w) - 2 * balance.energy, ca.dot(across, w)
+    curvature = ca.dot(across, bent) - 2 * balance.energy * ca.sumsqr(across) / square
+    t = -excess / (slope + ca.sqrt(ca.fmax(slope**2 - curvature * excess, 0)) + TINY)
+    t = ca.if_else(balance.touching, 0, t)
+    direction = angular + t * across
+    direction = direction * ca.sqrt(square / (ca.sumsqr(direction) + TINY))
+    turn = ca.vertcat(square + ca.dot(direction, angular), cross(direction, angular))
+    orientation = quaternion_product(q[3:7], turn)
+    q = ca.vertcat(q[:3], orientation / ca.norm_2(orientation))
+    w = solve_positive_definite(inertia, direction)
+    R = quaternion_to_rotation(q[3:7])
+    u = R.T @ balance.linear / composite.mass - cross(w, composite.center)
+    center, energy = q[:3] + R @ composite.center, ca.dot(direction, w) / 2
+    return q, ca.vertcat(w, u), replace(balance, center=center, energy=energy, touching=SX(0))
 
 
 def _scaling(kept: SX, energy: SX, touching: SX, other: SX | float = 0.0) -> SX:

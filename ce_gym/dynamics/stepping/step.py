@@ -135,6 +135,7 @@ class Stepped:
         iterate: For the next iteration; once converged, a fixed point.
         error: Estimate of the error of the step in `v` [rad/s or m/s]; 0 for a method that has none.
         balance: Momentum and energy that the velocities of the state do not have yet, see `conserved`; None if they do.
+        uncorrected: State before `finished` corrected it, to which the forces belong; None if it is `state`.
     """
 
     state: State
@@ -143,6 +144,7 @@ class Stepped:
     iterate: SX
     error: SX
     balance: Balance | None = None
+    uncorrected: State | None = None
 
     @cached_property
     def _sources(self) -> dict[str, LinearForce]:
@@ -153,7 +155,7 @@ class Stepped:
     def output(self, name: str) -> SX:
         """Return an output of one of the laws; a column of no entries if the scene does not have the law."""
         force = self._sources.get(name)
-        return SX(0, 1) if force is None else force.output(name, self.solved.motion, self.state)
+        return SX(0, 1) if force is None else force.output(name, self.solved.motion, self.uncorrected or self.state)
 
 
 def linearise(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> System:
@@ -297,17 +299,17 @@ def external_wrenches(solved: Solved) -> list[tuple[str, SX]]:
 
 
 def conserved(mechanism: Mechanism, state: State, balance: Balance) -> State:
-    """Return a state with the velocities that a balance asks for."""
-    return state.replaced(v=conserving_velocity(mechanism, state.q, state.v, state.dependent, balance)[0])
+    """Return a state with the velocities, and for a single body the orientation, that a balance asks for."""
+    q, v, _ = conserving_velocity(mechanism, state.q, state.v, state.dependent, balance)
+    return state.replaced(q=q, v=v)
 
 
 def finished(stepped: Stepped) -> Stepped:
     """Return a step whose velocities have their momentum and energy."""
     if stepped.balance is None:
         return stepped
-    return replace(
-        stepped, state=conserved(stepped.solved.system.start.scene.mechanism, stepped.state, stepped.balance)
-    )
+    state = conserved(stepped.solved.system.start.scene.mechanism, stepped.state, stepped.balance)
+    return replace(stepped, state=state, uncorrected=stepped.state)
 
 
 def any_check(forces: Sequence[LinearForce], motion: Motion) -> SX:

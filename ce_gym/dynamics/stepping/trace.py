@@ -113,13 +113,15 @@ def conserve_function(mechanism: Mechanism, options: StepOptions) -> ca.Function
     """Trace the velocities after a stage from its momentum and energy; a robot that has diverged keeps its own.
 
     Returns:
-        Function (q, v, dependent, diverged, parameters, dt, balance) -> (v, balance); and `MOVED`, if the stage is the
-        whole step.
+        Function (q, v, dependent, diverged, parameters, dt, balance) -> (v, balance), and `MOVED` if the stage is the
+        whole step, and q of a robot without joints.
     """
     given, column = Given(mechanism, options), SX.sym(BALANCE, balance_size(mechanism))
     state, balance = given.state, Balance.from_column(column)
-    v, balance = conserving_velocity(given.scene.mechanism, state.q, state.v, state.dependent, balance)
+    q, v, balance = conserving_velocity(given.scene.mechanism, state.q, state.v, state.dependent, balance)
     results = {"v_next": ca.if_else(given.diverged, state.v, v), f"{BALANCE}_next": balance.column}
+    if q is not state.q:
+        results["q_next"] = ca.if_else(given.diverged, state.q, q)
     if METHODS[options.method].single:
         results[MOVED] = furthest(mechanism, results["v_next"], given.dt)
     return traced("conserve", _needed(given.inputs() | {BALANCE: column}, results), results)
@@ -159,8 +161,8 @@ def combination_function(mechanism: Mechanism, options: StepOptions, step: StepV
     given |= {step.stages[stage][BALANCE].name: column for stage, column in columns.items()}
     balance = combined_balance(plan, {stage: Balance.from_column(column) for stage, column in columns.items()})
     after = combined(plan, ends, layout)
-    v, balance = conserving_velocity(whole.scene.mechanism, after.q, after.v, after.dependent, balance)
-    after = after.replaced(v=v)
+    q, v, balance = conserving_velocity(whole.scene.mechanism, after.q, after.v, after.dependent, balance)
+    after = after.replaced(q=q, v=v)
     sane = ca.logic_and(ca.sumsqr(after.v) < SANE_SPEED**2, ca.sum1(stacked(list(flags.values()))) < 0.5)
     results = {name: ca.if_else(sane, after[name], value) for name, value in before.items()}
     results |= {"diverged": ca.if_else(sane, 0, 1), BALANCE: balance.column}
