@@ -53,10 +53,11 @@ class GpuLauncher:
 
     Args:
         code: machine code for the architecture of the GPU.
+        threads: threads of a robot.
         gpu: number of the GPU.
     """
 
-    def __init__(self, code: bytes, gpu: int = 0):
+    def __init__(self, code: bytes, threads: int, gpu: int = 0):
         import torch
         from cuda.core import Device, LaunchConfig, ObjectCode, launch
 
@@ -64,11 +65,11 @@ class GpuLauncher:
         self._device, self._launch, self._config, self._torch = Device(gpu), launch, LaunchConfig, torch
         self._device.set_current()
         self._kernel = ObjectCode.from_cubin(code).get_kernel(ENTRY)
-        self._gpu = gpu
+        self._gpu, self._threads = gpu, threads
 
     def __call__(self, addresses: Sequence[int], numbers: Sequence[int], count: int) -> None:
-        """Launch on the current stream of torch, with a thread for each robot."""
+        """Launch on the current stream of torch, with the threads of each robot."""
         stream = _Stream(self._torch.cuda.current_stream(self._gpu).cuda_stream)
         self._device.set_current()
-        config = self._config(grid=-(-count // BLOCK), block=BLOCK)
+        config = self._config(grid=-(-count * self._threads // BLOCK), block=BLOCK)
         self._launch(stream, config, self._kernel, *addresses, *map(np.int32, (*numbers, count)))

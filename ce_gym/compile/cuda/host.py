@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ce_gym.compile.cache import cache_folder, read_or_make
-from ce_gym.compile.cuda.source import BLOCK, ENTRY, Source
+from ce_gym.compile.cuda.source import ENTRY, Source
 
 SHIM = """#include <cmath>
 #include <cstring>
@@ -29,13 +29,77 @@ using namespace std;
 #define __forceinline__ inline
 #define __noinline__
 #define __launch_bounds__(...)
-struct Place { unsigned x; };
-static thread_local Place blockIdx, threadIdx;
 static double __longlong_as_double(long long a) { double b; memcpy(&b, &a, 8); return b; }
 static long long __double_as_longlong(double a) { long long b; memcpy(&b, &a, 8); return b; }
 static float __int_as_float(int a) { float b; memcpy(&b, &a, 4); return b; }
 static int __float_as_int(float a) { int b; memcpy(&b, &a, 4); return b; }
 """
+
+ALONE = """
+#define EACH(T) T
+#define WARP 1
+template <class T> T choose(bool yes, T a, T b) { return yes ? a : b; }
+struct Place { unsigned x; };
+static thread_local Place blockIdx, threadIdx;
+static void set_thread(unsigned first) { threadIdx.x = first; }
+"""
+"""Threads run one after the other."""
+
+TOGETHER = """
+#define EACH(T) Lanes<T>
+#define WARP 16
+#define EVERY(i) for (int i = 0; i < WARP; ++i)
+#define BINARY(R, SIGN) \\
+    friend Lanes<R> operator SIGN(Lanes a, Lanes b) { Lanes<R> c; EVERY(i) c.lane[i] = a.lane[i] SIGN b.lane[i]; return c; }
+#define SHIFT(SIGN) \\
+    template <class U> friend Lanes operator SIGN(Lanes a, Lanes<U> b) { EVERY(i) a.lane[i] = a.lane[i] SIGN b.lane[i]; return a; }
+
+template <class T> struct Lanes {
+    T lane[WARP];
+    Lanes() {}
+    Lanes(T x) { EVERY(i) lane[i] = x; }
+    template <class U> explicit Lanes(const Lanes<U>& x) { EVERY(i) lane[i] = T(x.lane[i]); }
+    Lanes operator-() const { Lanes c; EVERY(i) c.lane[i] = -lane[i]; return c; }
+    Lanes<bool> operator!() const { Lanes<bool> c; EVERY(i) c.lane[i] = !lane[i]; return c; }
+    BINARY(T, +) BINARY(T, -) BINARY(T, *) BINARY(T, /) BINARY(T, %) BINARY(T, &) BINARY(T, |) BINARY(T, ^)
+    BINARY(bool, <) BINARY(bool, >) BINARY(bool, <=) BINARY(bool, >=) BINARY(bool, ==) BINARY(bool, !=)
+    SHIFT(<<) SHIFT(>>)
+};
+typedef Lanes<float> Floats;
+typedef Lanes<double> Doubles;
+#define UNARY(R, T, NAME) static R NAME(T x) { R c; EVERY(i) c.lane[i] = NAME(x.lane[i]); return c; }
+#define FUNCTIONS(T, f) \\
+    UNARY(T, T, sqrt##f) UNARY(T, T, fabs##f) UNARY(T, T, floor##f) UNARY(T, T, ceil##f) UNARY(T, T, rint##f) UNARY(T, T, trunc##f) \\
+    static T fmin##f(T a, T b) { EVERY(i) a.lane[i] = fmin##f(a.lane[i], b.lane[i]); return a; } \\
+    static T fmax##f(T a, T b) { EVERY(i) a.lane[i] = fmax##f(a.lane[i], b.lane[i]); return a; } \\
+    static T copysign##f(T a, T b) { EVERY(i) a.lane[i] = copysign##f(a.lane[i], b.lane[i]); return a; } \\
+    static T fma##f(T a, T b, T c) { EVERY(i) a.lane[i] = fma##f(a.lane[i], b.lane[i], c.lane[i]); return a; }
+FUNCTIONS(Floats, f)
+FUNCTIONS(Doubles, )
+UNARY(Doubles, Lanes<long long>, __longlong_as_double)
+UNARY(Lanes<long long>, Doubles, __double_as_longlong)
+UNARY(Floats, Lanes<int>, __int_as_float)
+UNARY(Lanes<int>, Floats, __float_as_int)
+
+typedef Lanes<unsigned long long> Words;
+struct Place { Words x; };
+static thread_local Place blockIdx, threadIdx;
+static void set_thread(unsigned first) { EVERY(i) threadIdx.x.lane[i] = first + i; }
+template <class T> T choose(Lanes<bool> yes, T a, T b) { EVERY(i) if (yes.lane[i]) b.lane[i] = a.lane[i]; return b; }
+template <class T> Lanes<T> fetch(const T* from, Words at) { Lanes<T> c; EVERY(i) c.lane[i] = from[at.lane[i]]; return c; }
+template <class T, class U> void put(Lanes<bool> yes, T* to, Words at, Lanes<U> x)
+{
+    EVERY(i) if (yes.lane[i]) to[at.lane[i]] = T(x.lane[i]);
+}
+static bool any(Lanes<bool> flag) { EVERY(i) if (flag.lane[i]) return true; return false; }
+template <int COUNT, class T> Lanes<T> from_limb(Lanes<T> x, int limb)
+{
+    Lanes<T> c;
+    EVERY(i) c.lane[i] = x.lane[i - i % COUNT + limb];
+    return c;
+}
+"""
+"""A value stands for all threads of a warp, so that they exchange values. Here a warp has 16 threads."""
 
 OPTIONS = ("-std=c++17", "-O0", "-w", "-ffp-contract=off", "-shared", "-fPIC")
 """Without optimisation, which takes minutes; nothing is fused or reordered."""
@@ -65,7 +129,8 @@ class HostLauncher:
         compiler = host_compiler()
         if compiler is None:
             raise RuntimeError("no C++ compiler (c++, g++, clang++ or the package ziglang) to run CUDA C on the host")
-        text = SHIM + source.text + _loop(source.text)
+        threads = ALONE if source.threads == 1 else TOGETHER
+        text = SHIM + threads + source.text + _loop(source.text, source.threads)
         name = "host_" + hashlib.sha256(" ".join((*compiler, *OPTIONS, text)).encode()).hexdigest()[:24]
         _, code = read_or_make(cache_folder(), name, lambda: ({}, _compile(compiler, text, source.layout.name)))
         self._run = _load(code).run_all
@@ -101,8 +166,8 @@ def _load(code: bytes) -> ctypes.CDLL:
         return ctypes.CDLL(str(file))
 
 
-def _loop(text: str) -> str:
-    """Return a C function with the arguments of the kernel that runs its threads one after the other."""
+def _loop(text: str, threads: int) -> str:
+    """Return a C function with the arguments of the kernel that runs the threads of all robots."""
     found = re.search(rf'extern "C" __global__ void [^;{{]*? {ENTRY}\((?P<arguments>[^)]*)\)', text)
     assert found, "no kernel in the source"
     arguments = " ".join(found["arguments"].split())
@@ -110,9 +175,9 @@ def _loop(text: str) -> str:
     return f"""
 extern "C" void run_all({arguments})
 {{
-    for (unsigned thread = 0; thread < unsigned(count); ++thread) {{
-        blockIdx.x = thread / {BLOCK};
-        threadIdx.x = thread % {BLOCK};
+    blockIdx.x = 0;
+    for (unsigned first = 0; first < {threads} * unsigned(count); first += WARP) {{
+        set_thread(first);
         {ENTRY}({names});
     }}
 }}

@@ -44,7 +44,7 @@ def load_cuda_kernel(key: str, build: Stages, dtype: str, gpu: int = 0) -> CudaK
     with _lock:
         if (folder, name, gpu) not in _loaded:
             code, source, _ = cached_cubin(folder, name, build, dtype, arch)
-            _loaded[folder, name, gpu] = CudaKernel(source, GpuLauncher(code, gpu), f"cuda:{gpu}")
+            _loaded[folder, name, gpu] = CudaKernel(source, GpuLauncher(code, source.threads, gpu), f"cuda:{gpu}")
         return _loaded[folder, name, gpu]
 
 
@@ -61,7 +61,8 @@ def cached_cubin(folder: Path | None, name: str, build: Stages, dtype: str, arch
         Machine code, the source, and the resources of a thread.
     """
     record, code = read_or_make(folder, name, lambda: _compile(build, dtype, arch, folder))
-    return code, Source(record["text"], layout_from(record["layout"])), Usage(**record["usage"])
+    source = Source(record["text"], layout_from(record["layout"]), record["threads"])
+    return code, source, Usage(**record["usage"])
 
 
 def _compile(build: Stages, dtype: str, arch: str, folder: Path | None) -> tuple[dict, bytes]:
@@ -70,7 +71,7 @@ def _compile(build: Stages, dtype: str, arch: str, folder: Path | None) -> tuple
     source = emit_source(build(), dtype)
     with announced(f"{source.layout.name} ({dtype}, {arch})", folder, started):
         code, usage = compile_cubin(source.text, arch)
-    return {"text": source.text, "layout": asdict(source.layout), "usage": asdict(usage)}, code
+    return asdict(source) | {"usage": asdict(usage)}, code
 
 
 def host_kernel(build: Stages, dtype: str) -> CudaKernel:

@@ -6,20 +6,52 @@ Random numbers and look-ups are also implemented for the CPU, in `random` and `l
 from ce_gym.compile.lowering.random import FIRST_FACTOR, GOLDEN, RANDOM_BITS, SECOND_FACTOR
 
 TYPES = {
-    "float64": """typedef double real;
-typedef unsigned long long bits;
+    "float64": """typedef EACH(double) real;
+typedef EACH(unsigned long long) bits;
+typedef EACH(long long) signed_bits;
 #define INFINITE __longlong_as_double(0x7ff0000000000000ll)
 #define NOT_A_NUMBER __longlong_as_double(0x7ff8000000000000ll)
 """,
-    "float32": """typedef float real;
-typedef unsigned int bits;
+    "float32": """typedef EACH(float) real;
+typedef EACH(unsigned int) bits;
+typedef EACH(int) signed_bits;
 #define INFINITE __int_as_float(0x7f800000)
 #define NOT_A_NUMBER __int_as_float(0x7fc00000)
 """,
 }
 
-HELPERS = """typedef unsigned long long word;
+THREAD = """// `host` defines these for the CPU, where a value may stand for several threads.
+#ifdef __CUDACC__
+#define EACH(T) T
 
+template <class T> __device__ __forceinline__ T choose(bool yes, T a, T b) { return yes ? a : b; }
+#endif
+
+typedef EACH(bool) mask;
+typedef EACH(unsigned long long) word;
+"""
+
+LIMBS = """
+#ifdef __CUDACC__
+template <class T> __device__ __forceinline__ T fetch(const T* from, word i) { return from[i]; }
+
+template <class T, class U> __device__ __forceinline__ void put(bool yes, T* to, word i, U x)
+{
+    if (yes) to[i] = T(x);
+}
+
+// Whether a flag is set for some robot of the warp.
+__device__ __forceinline__ bool any(bool flag) { return __any_sync(0xffffffffu, flag); }
+
+// The value of the thread of another limb of the same robot.
+template <int COUNT> __device__ __forceinline__ real from_limb(real x, int limb)
+{
+    return __shfl_sync(0xffffffffu, x, limb, COUNT);
+}
+#endif
+"""
+
+COPIES = """
 // Arrays that stay on the GPU are (size, robots), so that neighbouring threads read neighbouring numbers.
 template <int SIZE> __device__ __forceinline__ void read_lane(real* to, const real* from, word lane, word robots)
 {
@@ -196,15 +228,17 @@ template <int PLACES, int POINTS> __device__ void look_up_grid(
 """
 
 
-def prelude(dtype: str, *, random: bool, lookup: bool) -> str:
+def prelude(dtype: str, *, limbs: bool, random: bool, lookup: bool) -> str:
     """Return the beginning of a source.
 
     Args:
         dtype: `float64` or `float32`.
+        limbs: whether a thread computes a limb, and not a robot.
         random: whether random numbers are drawn.
         lookup: whether tables are looked up.
     """
     shift = 64 - RANDOM_BITS[dtype]
     scale = (2.0 ** -RANDOM_BITS[dtype]).hex()
     figures = {"first": FIRST_FACTOR, "second": SECOND_FACTOR, "golden": GOLDEN, "shift": shift, "scale": scale}
-    return TYPES[dtype] + HELPERS + (RANDOM.format(**figures) if random else "") + (LOOKUP if lookup else "")
+    parts = (LIMBS if limbs else COPIES, RANDOM.format(**figures) if random else "", LOOKUP if lookup else "")
+    return THREAD + TYPES[dtype] + "".join(parts)

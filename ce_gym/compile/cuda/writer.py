@@ -12,7 +12,6 @@ from math import inf, isnan
 import numpy as np
 
 WIDTH = {"float64": 64, "float32": 32}
-SIGNED = {64: "long long", 32: "int"}
 INTEGER = {"add": "+", "sub": "-", "and_": "&", "or_": "|", "xor": "^", "shl": "<<"}
 """Operations on bits, some of them on masks too."""
 NAMES = {"minnum": "fmin", "maxnum": "fmax"}
@@ -23,7 +22,7 @@ class Term(str):
     """A C expression without side effects: a literal or the name of a constant. Equal texts are equal values.
 
     Attributes:
-        kind: type: `real`, `bits` (unsigned, as wide as a number) or `bool`.
+        kind: type: `real`, `bits` (unsigned, as wide as a number) or `mask`.
     """
 
     kind: str
@@ -111,11 +110,15 @@ class Writer:
 
     def compare(self, sign: str, a: Term, b: Term) -> Term:
         """Return a mask; every comparison with NaN is false except `!=`."""
-        return self.let("bool", f"{a} {sign} {b}")
+        return self.let("mask", f"{a} {sign} {b}")
 
     def select(self, mask: Term, a: Term, b: Term) -> Term:
         """Return `a` where the mask is true, else `b`."""
-        return self.let(a.kind, f"{mask} ? {a} : {b}")
+        return self.let(a.kind, f"choose<{a.kind}>({mask}, {a}, {b})")
+
+    def from_limb(self, a: Term, limb: int, count: int) -> Term:
+        """Return the value of the thread of another limb of the same robot."""
+        return self.let("real", f"from_limb<{count}>({a}, {limb})")
 
     def to_bits(self, a: Term) -> Term:
         """Return the bits of a number as an integer."""
@@ -128,11 +131,11 @@ class Writer:
 
     def signed(self, a: Term) -> str:
         """Return an integer as a signed one."""
-        return f"({SIGNED[self.bits]}){a}"
+        return f"(signed_bits){a}"
 
     def is_odd(self, bits: Term) -> Term:
         """Return a mask: whether the lowest bit of an integer is set."""
-        return self.let("bool", f"({bits} & 1) != 0")
+        return self.let("mask", f"({bits} & 1) != 0")
 
     def load(self, base: str, index: int) -> Term:
         """Return the current value `index` of a buffer."""
@@ -157,7 +160,7 @@ class _Instructions:
 
     def not_(self, a: Term) -> Term:
         """Return the negation of a mask."""
-        return self._writer.let("bool", f"!{a}")
+        return self._writer.let("mask", f"!{a}")
 
     def ashr(self, a: Term, b: Term) -> Term:
         """Return bits shifted right arithmetically."""
@@ -169,4 +172,4 @@ class _Instructions:
 
     def icmp_signed(self, sign: str, a: Term, b: Term) -> Term:
         """Return a mask from two signed integers."""
-        return self._writer.let("bool", f"({self._writer.signed(a)}) {sign} ({self._writer.signed(b)})")
+        return self._writer.let("mask", f"({self._writer.signed(a)}) {sign} ({self._writer.signed(b)})")

@@ -74,7 +74,7 @@ def _outputs(function: casadi.Function, graph: Graph) -> list[set[int]]:
     return outputs
 
 
-def _dense_positions(sparsity: casadi.Sparsity) -> list[int]:
+def dense_positions(sparsity: casadi.Sparsity) -> list[int]:
     """Return the column-major position of each structural nonzero."""
     rows, columns = sparsity.get_triplet()
     return [row + column * sparsity.size1() for row, column in zip(rows, columns, strict=True)]
@@ -92,13 +92,13 @@ class _Lowering:
 
     def __init__(self, v: VectorBuilder, function: casadi.Function, arguments: Arguments, fragment: Fragment) -> None:
         self.v, self.function, self.arguments, self.fragment = v, function, arguments, fragment
-        self.operations = _Operations(v, function.name())
-        self.positions = [_dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
+        self.operations = Operations(v, function.name())
+        self.positions = [dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
         self.values: dict[int, Value] = {}
         self.loaded: dict[tuple[int, int], Value] = {}
         self.stored: set[tuple[int, int]] = set()
         self.destinations: dict[int, list[tuple[int, int]]] = defaultdict(list)
-        positions = [_dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
+        positions = [dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
         for k, op in enumerate(fragment.graph.ops):
             if op == casadi.OP_OUTPUT:
                 number, nonzero = function.instruction_output(k)
@@ -152,7 +152,7 @@ class _Lowering:
         return any(self.loaded.get((source, position)) is result for source in inputs)
 
 
-class _Operations:
+class Operations:
     """Emits operations; caches masks, constants and sine-cosine pairs of values already emitted."""
 
     def __init__(self, v: VectorBuilder, name: str):
@@ -260,7 +260,7 @@ OPERATIONS: dict[int, Operation] = {
     casadi.OP_FMIN: _intrinsic("minnum"),
     casadi.OP_FMAX: _intrinsic("maxnum"),
     casadi.OP_COPYSIGN: _intrinsic("copysign"),
-    casadi.OP_SIGN: _Operations.sign,
+    casadi.OP_SIGN: Operations.sign,
     casadi.OP_SIN: lambda s, x: s.sin_cos(x)[0],
     casadi.OP_COS: lambda s, x: s.sin_cos(x)[1],
     casadi.OP_TAN: _elementary("tan"),
@@ -271,15 +271,15 @@ OPERATIONS: dict[int, Operation] = {
     casadi.OP_EXP: _elementary("exp"),
     casadi.OP_LOG: _elementary("log"),
     casadi.OP_TANH: _elementary("tanh"),
-    casadi.OP_POW: _Operations.power,
-    casadi.OP_CONSTPOW: _Operations.power,
+    casadi.OP_POW: Operations.power,
+    casadi.OP_CONSTPOW: Operations.power,
     casadi.OP_HYPOT: lambda s, x, y: s.v.intrinsic("sqrt", s.v.add(s.v.mul(x, x), s.v.mul(y, y))),
     casadi.OP_FMOD: lambda s, x, y: vector_math.remainder(s.v, x, y, "trunc"),
     casadi.OP_REMAINDER: lambda s, x, y: vector_math.remainder(s.v, x, y, "rint"),
     casadi.OP_LT: _comparison("<"),
     casadi.OP_LE: _comparison("<="),
     casadi.OP_EQ: _comparison("=="),
-    casadi.OP_NE: _Operations.differ,
+    casadi.OP_NE: Operations.differ,
     casadi.OP_NOT: lambda s, a: s.truth(s.v.builder.not_(s.mask(a))),
     casadi.OP_AND: lambda s, a, b: s.truth(s.v.builder.and_(s.mask(a), s.mask(b))),
     casadi.OP_OR: lambda s, a, b: s.truth(s.v.builder.or_(s.mask(a), s.mask(b))),

@@ -70,7 +70,7 @@ def reached(nodes: Iterable[int], neighbours: Mapping[int, Iterable[int]]) -> se
 
 def graph_of(function: casadi.Function) -> Graph:
     """Return the graph of an SX function, rewritten."""
-    graph = _instructions(function)
+    graph = instructions_of(function)
     _form_selects(graph)
     _select_between_sums(graph)
     _use_reciprocals(graph)
@@ -84,7 +84,7 @@ def sources(function: casadi.Function, graph: Graph, inputs: Collection[int]) ->
     return {k for k in nodes if function.instruction_input(k)[0] in inputs}
 
 
-def _instructions(function: casadi.Function) -> Graph:
+def instructions_of(function: casadi.Function) -> Graph:
     """Return the instructions in static single assignment form: CasADi reuses registers."""
     registers = [-1] * function.sz_w()
     graph = Graph([], [], {})

@@ -1,0 +1,369 @@
+"""Equal limbs of a robot, found in a traced function, and the operations of a thread that computes one limb.
+
+Where the trace has one operation for each limb, a thread has one operation, and constants that differ are chosen by the
+number of the limb. Operations that concern all limbs are computed by every thread. A value of another limb comes from
+the thread of that limb. Each thread executes operations of the trace in their order. So results have the bits of the
+trace, whatever symmetry is found.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import casadi
+
+from ce_gym.compile.lowering.function import Arguments, Operations, dense_positions
+from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, NO_OPERATION, Graph, graph_of, instructions_of
+from ce_gym.compile.lowering.ordering import ordered
+from ce_gym.compile.program import Call, Program
+
+Group: TypeAlias = tuple[int, ...]
+"""A node of a graph, or an element of a buffer, for each limb; equal numbers if the limbs share it."""
+Slots: TypeAlias = Mapping[str, Sequence[Group]]
+"""The elements of each buffer that a thread holds, by limb."""
+FROM_LIMB, BY_LIMB = -7, -8
+"""Operations that a trace lacks: the value of another limb, and a choice by the number of the limb."""
+COUNTS = (8, 4, 2)
+"""Possible numbers of limbs: a warp holds whole robots."""
+SHARED = -1
+"""Number of the limb of everything that belongs to all limbs."""
+SHORT = 500
+"""Programs without longer functions have one thread for each robot."""
+MOST = 0.7
+"""Most operations of a thread, as a fraction of all: otherwise a thread computes a robot."""
+CHAINED = (casadi.OP_ADD, casadi.OP_AND, casadi.OP_OR, casadi.OP_FMAX, casadi.OP_FMIN)
+"""Operations that combine limbs one after the other; the place in the chain does not tell limbs apart."""
+COMMUTING = (*CHAINED, casadi.OP_MUL, casadi.OP_EQ, casadi.OP_NE, FMA, FMS, FNMA)
+"""Operations whose first two operands may be exchanged."""
+ALIKE = {casadi.OP_SUB: casadi.OP_ADD, casadi.OP_SQ: casadi.OP_MUL}
+
+
+@dataclass(frozen=True)
+class Folded:
+    """The operations of a thread.
+
+    Attributes:
+        graph: The operations, `FROM_LIMB` and `BY_LIMB` among them.
+        inputs: Number of the input, and slot, of each node that is an input.
+        constants: Constants that differ between limbs.
+        limbs: Limb that each `FROM_LIMB` reads, and number of limbs.
+        outputs: Node of each slot of each output, by number of the output and slot.
+    """
+
+    graph: Graph = field(default_factory=lambda: Graph([], [], {}))
+    inputs: dict[int, tuple[int, int]] = field(default_factory=dict)
+    constants: dict[int, tuple[float, ...]] = field(default_factory=dict)
+    limbs: dict[int, tuple[int, int]] = field(default_factory=dict)
+    outputs: dict[tuple[int, int], int] = field(default_factory=dict)
+
+    @property
+    def n_operations(self) -> int:
+        """Number of operations."""
+        return sum(op not in NO_OPERATION for op in self.graph.ops)
+
+
+def limb_slots(stages: Sequence[Program]) -> Slots:
+    """Return the slots of all buffers of a program of which a thread should compute one limb, else nothing."""
+    (program, *others), calls = stages, [call for stage in stages for call in stage.calls]
+    plain = all(b.kind in ("tiles", "rows_in", "scratch") for b in program.buffers)
+    if others or program.skip_unless or not plain or not all(isinstance(call, Call) for call in calls):
+        return {}
+    longest = max((call for call in calls if isinstance(call, Call)), key=lambda call: call.function.n_instructions())
+    function = longest.function
+    slots = find_slots(function, longest.inputs, longest.outputs) if function.n_instructions() > SHORT else {}
+    if not slots:
+        return {}
+    graph = graph_of(function)
+    n_operations = fold(function, graph, longest.inputs, dict(enumerate(longest.outputs)), slots).n_operations
+    if n_operations > MOST * Folded(graph).n_operations:
+        return {}
+    n = len(slots[longest.inputs[0]][0])
+    return {b.name: slots.get(b.name) or _slots(b.size, n, ()) for b in program.buffers}
+
+
+def lower_limb(v: Any, folded: Folded, arguments: Arguments) -> None:
+    """Emit the operations of a thread, which has masks `limb_1`, `limb_2`, ... for the bits of the number of its limb."""
+    graph, operations, values = folded.graph, Operations(v, "limb"), dict[int, Any]()
+
+    def value(k: int) -> Any:
+        if k in folded.constants:
+            values[k] = by_limb([v.const(number) for number in folded.constants[k]])
+        elif k in graph.constants:
+            values[k] = operations.constant(graph.constants[k])
+        elif k in folded.inputs:
+            number, slot = folded.inputs[k]
+            values[k] = v.load(arguments.inputs[number], slot)
+        return values[k]
+
+    def by_limb(of: Sequence[Any]) -> Any:
+        half = len(of) // 2
+        if not half or len(set(of)) == 1:
+            return of[0]
+        low, high = of[:half], of[half:]
+        return by_limb(low) if low == high else v.select(f"limb_{half}", by_limb(high), by_limb(low))
+
+    for k in ordered(graph):
+        operands = [values.get(a) or value(a) for a in graph.operands[k]]
+        if graph.ops[k] == FROM_LIMB:
+            values[k] = v.from_limb(operands[0], *folded.limbs[k])
+        elif graph.ops[k] == BY_LIMB:
+            values[k] = by_limb(operands)
+        else:
+            values[k] = operations.emit(graph.ops[k], operands)
+    for (number, slot), k in folded.outputs.items():
+        v.store(values.get(k) or value(k), arguments.outputs[number], slot)
+
+
+def find_slots(function: casadi.Function, inputs: Sequence[str], outputs: Sequence[str]) -> dict[str, list[Group]]:
+    """Return the slots of the buffers of a function whose trace has equal limbs, else nothing.
+
+    Two elements of an input have the same role if they are used in the same way. Elements of different roles belong to
+    one limb if an operation depends on them, and not on more elements of a role than a limb has.
+
+    Args:
+        function: The traced function.
+        inputs, outputs: Names of its buffers.
+    """
+    graph = instructions_of(function)
+    elements = _elements(function, graph)
+    by_use: dict[int, list[int]] = defaultdict(list)
+    for k, use in _uses(function, graph).items():
+        by_use[use].append(k)
+    weights = {n: sum(len(of) for of in by_use.values() if len(of) == n) for n in COUNTS}
+    n = max(COUNTS, key=lambda count: weights[count])
+    roles = {k: role for role, of in enumerate(by_use.values()) if len(of) % n == 0 for k in of}
+    limb_of = _limbs(graph, roles, elements, n)
+    slots = {}
+    for number, name in enumerate(inputs):
+        by_role: dict[int, list[list[int]]] = defaultdict(lambda: [[] for _ in range(n)])
+        for k, (at, position) in sorted(elements.items(), key=lambda item: item[1]):
+            if at == number and k in limb_of:
+                by_role[roles[k]][limb_of[k]].append(position)
+        slots[name] = _slots(
+            function.numel_in(number), n, (g for of in by_role.values() for g in zip(*of, strict=True))
+        )
+    if not limb_of:
+        return {}
+    folding = _Folding(function, graph_of(function), inputs, slots)
+    for number, name in enumerate(outputs):
+        if name not in slots:
+            nodes = folding.outputs[number]
+            homes = dict.fromkeys(folding.homes[k] for k in nodes if k in folding.homes)
+            groups = [tuple(map(nodes.index, home)) for home in homes if set(home) <= set(nodes)]
+            slots[name] = _slots(len(nodes), n, groups)
+    return slots
+
+
+def fold(
+    function: casadi.Function, graph: Graph, inputs: Sequence[str], outputs: Mapping[int, str], slots: Slots
+) -> Folded:
+    """Return the operations of a thread for a function, or for a fragment of the function.
+
+    Args:
+        function: The traced function.
+        graph: The graph of the function, or of the fragment.
+        inputs: Names of the buffers of the inputs.
+        outputs: Names of the buffers of the outputs that are computed, by number.
+        slots: Slots of all buffers.
+    """
+    folding = _Folding(function, graph, inputs, slots)
+    for number, name in outputs.items():
+        for slot, places in enumerate(slots[name]):
+            folding.folded.outputs[number, slot] = folding.add(tuple(folding.outputs[number][p] for p in places))
+    return folding.folded
+
+
+def _elements(function: casadi.Function, graph: Graph) -> dict[int, tuple[int, int]]:
+    """Return the number of the input, and the position in the input, of each node that is an input."""
+    positions = [dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
+    found = {}
+    for k, op in enumerate(graph.ops):
+        if op == casadi.OP_INPUT:
+            number, nonzero = function.instruction_input(k)
+            found[k] = number, positions[number][nonzero]
+    return found
+
+
+def _slots(size: int, n: int, groups: Iterable[Group]) -> list[Group]:
+    """Return the slots of a buffer: groups of elements, and all other elements for all limbs."""
+    found = list(groups)
+    known = {position for group in found for position in group}
+    return sorted(found + [(position,) * n for position in range(size) if position not in known])
+
+
+def _uses(function: casadi.Function, graph: Graph) -> dict[int, int]:
+    """Return a number for each node that is an input: equal if it is used in the same way, but for constants and signs."""
+    numbers: dict[tuple, int] = {}
+    users, uses = graph.users(), {}
+    kinds = [ALIKE.get(op, op) for op in graph.ops]
+    for k in reversed(range(len(kinds))):
+        users_of = [] if kinds[k] == casadi.OP_OUTPUT else users[k]
+        if len(users_of) == 1 and (kinds[k] == casadi.OP_NEG or kinds[k] in CHAINED and kinds[users_of[0]] == kinds[k]):
+            uses[k] = uses[users_of[0]]
+            continue
+        argument = 0
+        if kinds[k] == casadi.OP_OUTPUT:
+            argument = function.instruction_output(k)[0]
+        elif kinds[k] == casadi.OP_INPUT:
+            argument = function.instruction_input(k)[0]
+        following = {
+            (uses[u], 0 if kinds[u] in COMMUTING or kinds[u] == casadi.OP_NEG else graph.operands[u].index(k))
+            for u in users_of
+        }
+        uses[k] = numbers.setdefault((kinds[k], argument, *sorted(following)), len(numbers))
+    return {k: uses[k] for k, kind in enumerate(kinds) if kind == casadi.OP_INPUT}
+
+
+def _limbs(graph: Graph, roles: Mapping[int, int], elements: Mapping[int, tuple[int, int]], n: int) -> dict[int, int]:
+    """Return the number of the limb of each input that belongs to a limb with `n - 1` others like it."""
+    most = {role: count // n for role, count in Counter(roles.values()).items()}
+    part_of = {k: frozenset((k,)) for k in roles}
+    needs: list[frozenset[int]] = []
+    for k, operands in enumerate(graph.operands):
+        needs.append(
+            frozenset((k,)) & roles.keys() if k in elements else frozenset().union(*(needs[a] for a in operands))
+        )
+        union = frozenset().union(*(part_of[a] for a in needs[k]))
+        counts = Counter(roles[a] for a in union)
+        if all(counts[role] <= most[role] for role in counts):
+            part_of.update(dict.fromkeys(union, union))
+    alike: dict[tuple, list[frozenset[int]]] = defaultdict(list)
+    for part in sorted(set(part_of.values()), key=lambda part: min(elements[k] for k in part)):
+        alike[tuple(sorted(roles[k] for k in part))].append(part)
+    return {k: limb for parts in alike.values() if len(parts) == n for limb, part in enumerate(parts) for k in part}
+
+
+class _Folding:
+    """Builds the operations of a thread from the outputs backwards.
+
+    Attributes:
+        folded: Result.
+        outputs: Nodes of all elements of each output.
+        homes: For each node of a limb, the group of that node and its counterparts.
+    """
+
+    def __init__(self, function: casadi.Function, graph: Graph, inputs: Sequence[str], slots: Slots) -> None:
+        self.graph, self.folded = Graph(list(graph.ops), list(graph.operands), dict(graph.constants)), Folded()
+        self.n = len(next(iter(slots.values()))[0])
+        self._made: dict[Group, int] = {}
+        zero = self.graph.add(casadi.OP_CONST)
+        self.graph.constants[zero] = 0.0
+        self.outputs = [[zero] * function.numel_out(i) for i in range(function.n_out())]
+        positions = [dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
+        for k, op in enumerate(graph.ops):
+            if op == casadi.OP_OUTPUT:
+                number, nonzero = function.instruction_output(k)
+                self.outputs[number][positions[number][nonzero]] = graph.operands[k][0]
+        node_at = {place: k for k, place in _elements(function, graph).items()}
+        self._slot_of: dict[Group, tuple[int, int]] = {}
+        self.homes: dict[int, Group] = {}
+        for number, name in enumerate(inputs):
+            for slot, places in enumerate(slots[name]):
+                group = tuple(node_at.get((number, p), -1) for p in places)
+                self._slot_of[group] = number, slot
+                if len(set(places)) > 1:
+                    self.homes |= {k: group for k in group if k >= 0}
+        self._order = ordered(self.graph)
+        self._shapes = self._structure()
+        self._find_homes()
+
+    def _structure(self) -> list[int]:
+        """Return a number for each node: equal if nodes of two limbs are computed by the same operations."""
+        numbers: dict[tuple, int] = {}
+        shapes = [-1] * len(self.graph.ops)
+
+        def number(*shape) -> int:
+            return numbers.setdefault(shape, len(numbers))
+
+        for k, op in enumerate(self.graph.ops):
+            if op == casadi.OP_CONST:
+                shapes[k] = number("constant", abs(self.graph.constants[k]))
+            elif op == casadi.OP_INPUT:
+                shapes[k] = number("input", self.homes.get(k, (k,)))
+        for k in self._order:
+            op, of = self.graph.ops[k], [shapes[a] for a in self.graph.operands[k]]
+            if op in COMMUTING:
+                of[:2] = sorted(of[:2])
+            shapes[k] = number(op, *of)
+        return shapes
+
+    def _find_homes(self) -> None:
+        """Group the nodes of limbs, which depend on the inputs of one limb, with their counterparts."""
+        alike: dict[int, list[int]] = defaultdict(list)
+        for k in self._order:
+            alike[self._shapes[k]].append(k)
+        limb_of = {k: home.index(k) for k, home in self.homes.items()}
+        for shape in sorted(alike):  # operands have lower numbers
+            nodes: list[list[int]] = [[] for _ in range(self.n)]
+            for k in sorted(alike[shape]):
+                limbs = {limb_of[a] for a in self.graph.operands[k] if a in limb_of}
+                if len(limbs) == 1:
+                    nodes[limbs.pop()].append(k)
+            if len(set(map(len, nodes))) == 1:
+                for home in zip(*nodes, strict=True):
+                    limb_of |= {k: limb for limb, k in enumerate(home)}
+                    self.homes |= dict.fromkeys(home, home)
+
+    def add(self, group: Group) -> int:
+        """Return the node of the result for a group of nodes, after adding the node and all that it needs."""
+        waiting = [group]
+        while waiting:
+            group_now = waiting[-1]
+            if group_now in self._made:
+                waiting.pop()
+                continue
+            op, needs, limb = self._plan(group_now)
+            missing = [need for need in needs if need not in self._made]
+            if missing:
+                waiting += missing
+                continue
+            waiting.pop()
+            folded = self.folded
+            node = folded.graph.add(op, *(self._made[need] for need in needs))
+            self._made[group_now] = node
+            if op == FROM_LIMB:
+                folded.limbs[node] = limb, self.n
+            elif op == casadi.OP_INPUT:
+                folded.inputs[node] = self._slot_of[group_now]
+            elif op == casadi.OP_CONST:
+                values = tuple(self.graph.constants[k] for k in group_now)
+                if len(set(values)) > 1:
+                    folded.constants[node] = values
+                else:
+                    folded.graph.constants[node] = values[0]
+        return self._made[group]
+
+    def _plan(self, group: Group) -> tuple[int, list[Group], int]:
+        """Return the operation of a thread that computes a group, the groups that it needs, and the limb it reads."""
+        ops, operands = self.graph.ops, self.graph.operands
+        first = group[0]
+        if len(set(group)) == 1 and first in self.homes:
+            home = self.homes[first]
+            return FROM_LIMB, [home], home.index(first)
+        if group in self._slot_of:
+            return casadi.OP_INPUT, [], SHARED
+        if all(k in self.graph.constants for k in group):
+            return casadi.OP_CONST, [], SHARED
+        if len({ops[k] for k in group}) == 1 and ops[first] not in NO_OPERATION:
+            return ops[first], self._operands(group), SHARED
+        return BY_LIMB, [(k,) * self.n for k in group], SHARED
+
+    def _operands(self, group: Group) -> list[Group]:
+        """Return the groups of operands of nodes with the same operation."""
+        operands = [list(self.graph.operands[k]) for k in group]
+        if self.graph.ops[group[0]] in COMMUTING:
+            a, b = operands[0][:2]
+            for of in operands[1:]:
+                x, y = of[:2]
+                if self._likeness(a, y) + self._likeness(b, x) > self._likeness(a, x) + self._likeness(b, y):
+                    of[:2] = y, x
+        return list(zip(*operands, strict=True))
+
+    def _likeness(self, a: int, b: int) -> int:
+        """Return how well a node fits another one as its counterpart."""
+        if a == b or a in self.homes and self.homes[a] is self.homes.get(b):
+            return 2
+        return int(self._shapes[a] == self._shapes[b])
