@@ -1,12 +1,14 @@
 """GPU: agreement with the CPU, registers, sub-steps and environment steps per second, MuJoCo Warp.
 
 Without a GPU the benchmark compares the emitted source, run on the CPU, and reports registers from the run-time
-compiler. The other measurements are listed as not measured, with the reason.
+compiler. The other measurements are listed as not measured, with the reason. Each table is also printed to the standard
+error stream as soon as it is complete.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -28,6 +30,7 @@ from ce_gym.sim.devices import Device, Emulated, device_named
 DTYPES = ("float32", "float64")
 ARCHITECTURES = ("sm_80", "sm_90")
 BATCHES = (4096, 16384, 65536, 262144, 1048576)
+PARTS = ("agreement", "resources", "substeps", "environment", "warp")
 REQUIRED = {"sub-steps": 1e9, "environment": 200e6, "warp": 50.0}
 """Required sub-steps and environment steps per second, and ratio of speeds to MuJoCo Warp."""
 
@@ -39,27 +42,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--robot", default="mini_cheetah", help="robot that is timed")
     parser.add_argument("--batches", type=int, nargs="+", default=BATCHES, help="sizes of batches that are timed")
     parser.add_argument("--num-envs", type=int, default=256, help="robots of a batch whose agreement is measured")
+    parser.add_argument("--parts", nargs="+", default=PARTS, choices=PARTS, help="what is measured")
+    parser.add_argument("--compile-only", dest="parts", action="store_const", const=PARTS[1:2], help="only resources")
     parser.add_argument("--rounds", type=int, default=5, help="how often each is timed")
 
 
 def run(arguments: argparse.Namespace) -> Report:
     """Run the benchmark."""
-    report, missing = Report("gpu"), list[tuple[str, str, str]]()
+    report, missing = Report("gpu", tables=_Tables()), list[tuple[str, str, str]]()
     device, reason = _device()
     report.machine["GPU"] = gpu_speed.name_of(device) if not reason else f"none: {reason}"
     where = "on the GPU" if not reason else "emitted source run by the CPU"
-    try:
-        gpu_agreement.measure(arguments.robots, arguments.levels, arguments.num_envs, device, where, report)
-    except RuntimeError as problem:  # neither a GPU nor a C++ compiler
-        missing.append(("agreement with the CPU", "1e-11 and 1e-5", str(problem)))
-    try:
-        report.tables.append(_resources(arguments.robot))
-    except CudaUnavailable as problem:
-        missing.append(("registers, spills, occupancy", "", str(problem)))
+    if "agreement" in arguments.parts:
+        try:
+            gpu_agreement.measure(arguments.robots, arguments.levels, arguments.num_envs, device, where, report)
+        except RuntimeError as problem:  # neither a GPU nor a C++ compiler
+            missing.append(("agreement with the CPU", "1e-11 and 1e-5", str(problem)))
+    if "resources" in arguments.parts:
+        try:
+            report.tables.append(_resources(arguments.robot))
+        except CudaUnavailable as problem:
+            missing.append(("registers, spills, occupancy", "", str(problem)))
     _speed(arguments, device, reason, report, missing)
     if missing:
         report.tables.append(Table("NOT MEASURED", ("what", "required", "why"), tuple(missing)))
     return report
+
+
+class _Tables(list[Table]):
+    """Tables that are printed when they are added, because a run may be cut off."""
+
+    def append(self, table: Table) -> None:
+        """Add and print a table."""
+        super().append(table)
+        print(f"{table.as_text()}\n", file=sys.stderr, flush=True)
 
 
 def _device() -> tuple[Device, str]:
@@ -75,12 +91,12 @@ def _speed(
 ) -> None:
     """Add the rates on a GPU, or remarks that they were not measured, to the report."""
     required = {name: f"{figure:,.0f}" for name, figure in REQUIRED.items()}
-    rows: list[tuple[str, str, Callable[..., None]]] = [
-        ("sub-steps/s, exact, feet on the ground, best batch", required["sub-steps"], _substeps),
-        ("environment steps/s, exact, best batch", required["environment"], _environment),
-        ("times as fast as MuJoCo Warp", required["warp"], _warp),
-    ]
-    for what, bar, measure in progress(rows, "measurements"):
+    rows: dict[str, tuple[str, str, Callable[..., None]]] = {
+        "substeps": ("sub-steps/s, exact, feet on the ground, best batch", required["sub-steps"], _substeps),
+        "environment": ("environment steps/s, exact, best batch", required["environment"], _environment),
+        "warp": ("times as fast as MuJoCo Warp", required["warp"], _warp),
+    }
+    for what, bar, measure in progress([row for part, row in rows.items() if part in arguments.parts], "measurements"):
         if reason:
             missing.append((what, bar, reason))
             continue
@@ -146,8 +162,8 @@ def _resources(robot: str) -> Table:
                 seconds = time.perf_counter() - start
                 share = 100 * used.occupancy(arch, BLOCK)
                 figures = (used.registers, used.stack, used.spill_stores, used.spill_loads, share)
-                rows.append((name, dtype, arch, *figures, round(len(code) / 1024), seconds))
-    columns = ("kernel", "dtype", "for", "registers", "stack [B]", "spill stores [B]", "spill loads [B]")
-    columns += ("occupancy [%]", "code [KiB]", "compile [s]")
+                rows.append((name, dtype, arch, source.threads, *figures, round(len(code) / 1024), seconds))
+    columns = ("kernel", "dtype", "for", "threads of a robot", "registers", "stack [B]", "spill stores [B]")
+    columns += ("spill loads [B]", "occupancy [%]", "code [KiB]", "compile [s]")
     title = f"What a thread takes, {robot} exact, by NVRTC {nvrtc.compiler_version()}, blocks of {BLOCK}"
     return Table(title, columns, tuple(rows))

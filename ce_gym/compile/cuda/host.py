@@ -45,14 +45,23 @@ static void set_thread(unsigned first) { threadIdx.x = first; }
 """
 """Threads run one after the other."""
 
-TOGETHER = """
+TOGETHER = r"""
 #define EACH(T) Lanes<T>
 #define WARP 16
 #define EVERY(i) for (int i = 0; i < WARP; ++i)
-#define BINARY(R, SIGN) \\
-    friend Lanes<R> operator SIGN(Lanes a, Lanes b) { Lanes<R> c; EVERY(i) c.lane[i] = a.lane[i] SIGN b.lane[i]; return c; }
-#define SHIFT(SIGN) \\
-    template <class U> friend Lanes operator SIGN(Lanes a, Lanes<U> b) { EVERY(i) a.lane[i] = a.lane[i] SIGN b.lane[i]; return a; }
+#define BINARY(R, SIGN) \
+    friend Lanes<R> operator SIGN(Lanes a, Lanes b) \
+    { \
+        Lanes<R> c; \
+        EVERY(i) c.lane[i] = a.lane[i] SIGN b.lane[i]; \
+        return c; \
+    }
+#define SHIFT(SIGN) \
+    template <class U> friend Lanes operator SIGN(Lanes a, Lanes<U> b) \
+    { \
+        EVERY(i) a.lane[i] = a.lane[i] SIGN b.lane[i]; \
+        return a; \
+    }
 
 template <class T> struct Lanes {
     T lane[WARP];
@@ -65,33 +74,49 @@ template <class T> struct Lanes {
     BINARY(bool, <) BINARY(bool, >) BINARY(bool, <=) BINARY(bool, >=) BINARY(bool, ==) BINARY(bool, !=)
     SHIFT(<<) SHIFT(>>)
 };
-typedef Lanes<float> Floats;
-typedef Lanes<double> Doubles;
-#define UNARY(R, T, NAME) static R NAME(T x) { R c; EVERY(i) c.lane[i] = NAME(x.lane[i]); return c; }
-#define FUNCTIONS(T, f) \\
-    UNARY(T, T, sqrt##f) UNARY(T, T, fabs##f) UNARY(T, T, floor##f) UNARY(T, T, ceil##f) UNARY(T, T, rint##f) UNARY(T, T, trunc##f) \\
-    static T fmin##f(T a, T b) { EVERY(i) a.lane[i] = fmin##f(a.lane[i], b.lane[i]); return a; } \\
-    static T fmax##f(T a, T b) { EVERY(i) a.lane[i] = fmax##f(a.lane[i], b.lane[i]); return a; } \\
-    static T copysign##f(T a, T b) { EVERY(i) a.lane[i] = copysign##f(a.lane[i], b.lane[i]); return a; } \\
-    static T fma##f(T a, T b, T c) { EVERY(i) a.lane[i] = fma##f(a.lane[i], b.lane[i], c.lane[i]); return a; }
-FUNCTIONS(Floats, f)
-FUNCTIONS(Doubles, )
-UNARY(Doubles, Lanes<long long>, __longlong_as_double)
-UNARY(Lanes<long long>, Doubles, __double_as_longlong)
-UNARY(Floats, Lanes<int>, __int_as_float)
-UNARY(Lanes<int>, Floats, __float_as_int)
+
+#define UNARY(R, T, NAME) static R NAME(T a) { R c; EVERY(i) c.lane[i] = NAME(a.lane[i]); return c; }
+#define OF_TWO(T, NAME) static T NAME(T a, T b) { EVERY(i) a.lane[i] = NAME(a.lane[i], b.lane[i]); return a; }
+#define FUNCTIONS(T, f) \
+    UNARY(T, T, sqrt##f) UNARY(T, T, fabs##f) UNARY(T, T, floor##f) UNARY(T, T, ceil##f) \
+    UNARY(T, T, rint##f) UNARY(T, T, trunc##f) OF_TWO(T, fmin##f) OF_TWO(T, fmax##f) OF_TWO(T, copysign##f) \
+    static T fma##f(T a, T b, T c) { EVERY(i) c.lane[i] = fma##f(a.lane[i], b.lane[i], c.lane[i]); return c; }
+FUNCTIONS(Lanes<float>, f)
+FUNCTIONS(Lanes<double>, )
+UNARY(Lanes<double>, Lanes<long long>, __longlong_as_double)
+UNARY(Lanes<long long>, Lanes<double>, __double_as_longlong)
+UNARY(Lanes<float>, Lanes<int>, __int_as_float)
+UNARY(Lanes<int>, Lanes<float>, __float_as_int)
 
 typedef Lanes<unsigned long long> Words;
 struct Place { Words x; };
 static thread_local Place blockIdx, threadIdx;
 static void set_thread(unsigned first) { EVERY(i) threadIdx.x.lane[i] = first + i; }
-template <class T> T choose(Lanes<bool> yes, T a, T b) { EVERY(i) if (yes.lane[i]) b.lane[i] = a.lane[i]; return b; }
-template <class T> Lanes<T> fetch(const T* from, Words at) { Lanes<T> c; EVERY(i) c.lane[i] = from[at.lane[i]]; return c; }
+
+template <class T> T choose(Lanes<bool> yes, T a, T b)
+{
+    EVERY(i) if (yes.lane[i]) b.lane[i] = a.lane[i];
+    return b;
+}
+
+template <class T> Lanes<T> fetch(const T* from, Words at)
+{
+    Lanes<T> c;
+    EVERY(i) c.lane[i] = from[at.lane[i]];
+    return c;
+}
+
 template <class T, class U> void put(Lanes<bool> yes, T* to, Words at, Lanes<U> x)
 {
     EVERY(i) if (yes.lane[i]) to[at.lane[i]] = T(x.lane[i]);
 }
-static bool any(Lanes<bool> flag) { EVERY(i) if (flag.lane[i]) return true; return false; }
+
+static bool any(Lanes<bool> flag)
+{
+    EVERY(i) if (flag.lane[i]) return true;
+    return false;
+}
+
 template <int COUNT, class T> Lanes<T> from_limb(Lanes<T> x, int limb)
 {
     Lanes<T> c;
@@ -99,7 +124,7 @@ template <int COUNT, class T> Lanes<T> from_limb(Lanes<T> x, int limb)
     return c;
 }
 """
-"""A value stands for all threads of a warp, so that they exchange values. Here a warp has 16 threads."""
+"""A value stands for all threads of a warp, which so can exchange values. A warp has 16 threads here."""
 
 OPTIONS = ("-std=c++17", "-O0", "-w", "-ffp-contract=off", "-shared", "-fPIC")
 """Without optimisation, which takes minutes; nothing is fused or reordered."""

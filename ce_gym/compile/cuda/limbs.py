@@ -9,7 +9,7 @@ trace, whatever symmetry is found.
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -28,8 +28,6 @@ FROM_LIMB, BY_LIMB = -7, -8
 """Operations that a trace lacks: the value of another limb, and a choice by the number of the limb."""
 COUNTS = (8, 4, 2)
 """Possible numbers of limbs: a warp holds whole robots."""
-SHARED = -1
-"""Number of the limb of everything that belongs to all limbs."""
 SHORT = 500
 """Programs without longer functions have one thread for each robot."""
 MOST = 0.7
@@ -85,7 +83,7 @@ def limb_slots(stages: Sequence[Program]) -> Slots:
 
 
 def lower_limb(v: Any, folded: Folded, arguments: Arguments) -> None:
-    """Emit the operations of a thread, which has masks `limb_1`, `limb_2`, ... for the bits of the number of its limb."""
+    """Emit the operations of a thread; the masks `limb_1`, `limb_2`, ... are the bits of the number of its limb."""
     graph, operations, values = folded.graph, Operations(v, "limb"), dict[int, Any]()
 
     def value(k: int) -> Any:
@@ -125,35 +123,32 @@ def find_slots(function: casadi.Function, inputs: Sequence[str], outputs: Sequen
 
     Args:
         function: The traced function.
-        inputs, outputs: Names of its buffers.
+        inputs: Names of the buffers of its inputs.
+        outputs: Names of the buffers of its outputs.
     """
     graph = instructions_of(function)
     elements = _elements(function, graph)
-    by_use: dict[int, list[int]] = defaultdict(list)
-    for k, use in _uses(function, graph).items():
-        by_use[use].append(k)
-    weights = {n: sum(len(of) for of in by_use.values() if len(of) == n) for n in COUNTS}
-    n = max(COUNTS, key=lambda count: weights[count])
-    roles = {k: role for role, of in enumerate(by_use.values()) if len(of) % n == 0 for k in of}
+    uses = _uses(function, graph)
+    counts = Counter(uses.values())
+    n = max(COUNTS, key=lambda count: sum(size for size in counts.values() if size == count))
+    roles = {k: use for k, use in uses.items() if counts[use] % n == 0}
     limb_of = _limbs(graph, roles, elements, n)
-    slots = {}
-    for number, name in enumerate(inputs):
-        by_role: dict[int, list[list[int]]] = defaultdict(lambda: [[] for _ in range(n)])
-        for k, (at, position) in sorted(elements.items(), key=lambda item: item[1]):
-            if at == number and k in limb_of:
-                by_role[roles[k]][limb_of[k]].append(position)
-        slots[name] = _slots(
-            function.numel_in(number), n, (g for of in by_role.values() for g in zip(*of, strict=True))
-        )
     if not limb_of:
         return {}
+    groups: dict[tuple[int, int], list[list[int]]] = defaultdict(lambda: [[] for _ in range(n)])
+    for k in sorted(limb_of, key=lambda k: elements[k]):
+        number, position = elements[k]
+        groups[number, roles[k]][limb_of[k]].append(position)
+    slots = {}
+    for number, name in enumerate(inputs):
+        of_input = [group for (at, _), of in groups.items() if at == number for group in zip(*of, strict=True)]
+        slots[name] = _slots(function.numel_in(number), n, of_input)
     folding = _Folding(function, graph_of(function), inputs, slots)
     for number, name in enumerate(outputs):
         if name not in slots:
             nodes = folding.outputs[number]
             homes = dict.fromkeys(folding.homes[k] for k in nodes if k in folding.homes)
-            groups = [tuple(map(nodes.index, home)) for home in homes if set(home) <= set(nodes)]
-            slots[name] = _slots(len(nodes), n, groups)
+            slots[name] = _slots(len(nodes), n, [tuple(map(nodes.index, h)) for h in homes if set(h) <= set(nodes)])
     return slots
 
 
@@ -195,25 +190,24 @@ def _slots(size: int, n: int, groups: Iterable[Group]) -> list[Group]:
 
 
 def _uses(function: casadi.Function, graph: Graph) -> dict[int, int]:
-    """Return a number for each node that is an input: equal if it is used in the same way, but for constants and signs."""
+    """Return a number for each input node, equal if two are used in the same way, but for constants and signs."""
     numbers: dict[tuple, int] = {}
     users, uses = graph.users(), {}
     kinds = [ALIKE.get(op, op) for op in graph.ops]
     for k in reversed(range(len(kinds))):
-        users_of = [] if kinds[k] == casadi.OP_OUTPUT else users[k]
-        if len(users_of) == 1 and (kinds[k] == casadi.OP_NEG or kinds[k] in CHAINED and kinds[users_of[0]] == kinds[k]):
-            uses[k] = uses[users_of[0]]
+        kind, following = kinds[k], users.get(k, [])
+        is_chained = len(following) == 1 and kind in CHAINED and kinds[following[0]] == kind
+        if is_chained or (len(following) == 1 and kind == casadi.OP_NEG):
+            uses[k] = uses[following[0]]
             continue
         argument = 0
-        if kinds[k] == casadi.OP_OUTPUT:
+        if kind == casadi.OP_OUTPUT:
             argument = function.instruction_output(k)[0]
-        elif kinds[k] == casadi.OP_INPUT:
+        elif kind == casadi.OP_INPUT:
             argument = function.instruction_input(k)[0]
-        following = {
-            (uses[u], 0 if kinds[u] in COMMUTING or kinds[u] == casadi.OP_NEG else graph.operands[u].index(k))
-            for u in users_of
-        }
-        uses[k] = numbers.setdefault((kinds[k], argument, *sorted(following)), len(numbers))
+        places = (0 if kinds[u] in COMMUTING else graph.operands[u].index(k) for u in following)
+        use = (kind, argument, *sorted(set(zip((uses[u] for u in following), places, strict=True))))
+        uses[k] = numbers.setdefault(use, len(numbers))
     return {k: uses[k] for k, kind in enumerate(kinds) if kind == casadi.OP_INPUT}
 
 
@@ -223,10 +217,8 @@ def _limbs(graph: Graph, roles: Mapping[int, int], elements: Mapping[int, tuple[
     part_of = {k: frozenset((k,)) for k in roles}
     needs: list[frozenset[int]] = []
     for k, operands in enumerate(graph.operands):
-        needs.append(
-            frozenset((k,)) & roles.keys() if k in elements else frozenset().union(*(needs[a] for a in operands))
-        )
-        union = frozenset().union(*(part_of[a] for a in needs[k]))
+        needs.append(frozenset((k,) if k in roles else ()).union(*(needs[a] for a in operands)))
+        union = frozenset[int]().union(*(part_of[a] for a in needs[k]))
         counts = Counter(roles[a] for a in union)
         if all(counts[role] <= most[role] for role in counts):
             part_of.update(dict.fromkeys(union, union))
@@ -280,7 +272,7 @@ class _Folding:
 
         for k, op in enumerate(self.graph.ops):
             if op == casadi.OP_CONST:
-                shapes[k] = number("constant", abs(self.graph.constants[k]))
+                shapes[k] = number("constant")
             elif op == casadi.OP_INPUT:
                 shapes[k] = number("input", self.homes.get(k, (k,)))
         for k in self._order:
@@ -308,48 +300,44 @@ class _Folding:
                     self.homes |= dict.fromkeys(home, home)
 
     def add(self, group: Group) -> int:
-        """Return the node of the result for a group of nodes, after adding the node and all that it needs."""
+        """Return the node of the result for a group of nodes, after adding that node and all that it needs."""
         waiting = [group]
         while waiting:
-            group_now = waiting[-1]
-            if group_now in self._made:
-                waiting.pop()
-                continue
-            op, needs, limb = self._plan(group_now)
+            op, needs = self._plan(waiting[-1])
             missing = [need for need in needs if need not in self._made]
             if missing:
                 waiting += missing
                 continue
-            waiting.pop()
-            folded = self.folded
-            node = folded.graph.add(op, *(self._made[need] for need in needs))
-            self._made[group_now] = node
-            if op == FROM_LIMB:
-                folded.limbs[node] = limb, self.n
-            elif op == casadi.OP_INPUT:
-                folded.inputs[node] = self._slot_of[group_now]
-            elif op == casadi.OP_CONST:
-                values = tuple(self.graph.constants[k] for k in group_now)
-                if len(set(values)) > 1:
-                    folded.constants[node] = values
-                else:
-                    folded.graph.constants[node] = values[0]
+            current = waiting.pop()
+            if current not in self._made:
+                self._made[current] = self.folded.graph.add(op, *(self._made[need] for need in needs))
+                self._describe(self._made[current], op, current)
         return self._made[group]
 
-    def _plan(self, group: Group) -> tuple[int, list[Group], int]:
-        """Return the operation of a thread that computes a group, the groups that it needs, and the limb it reads."""
-        ops, operands = self.graph.ops, self.graph.operands
-        first = group[0]
+    def _describe(self, node: int, op: int, group: Group) -> None:
+        """Record what the operation of a new node does not say."""
+        folded, known = self.folded, self.graph.constants
+        if op == FROM_LIMB:
+            folded.limbs[node] = self.homes[group[0]].index(group[0]), self.n
+        elif op == casadi.OP_INPUT:
+            folded.inputs[node] = self._slot_of[group]
+        elif op == casadi.OP_CONST and len({known[k] for k in group}) > 1:
+            folded.constants[node] = tuple(known[k] for k in group)
+        elif op == casadi.OP_CONST:
+            folded.graph.constants[node] = known[group[0]]
+
+    def _plan(self, group: Group) -> tuple[int, list[Group]]:
+        """Return the operation of a thread that computes a group, and the groups that it needs."""
+        ops, first = self.graph.ops, group[0]
         if len(set(group)) == 1 and first in self.homes:
-            home = self.homes[first]
-            return FROM_LIMB, [home], home.index(first)
+            return FROM_LIMB, [self.homes[first]]
         if group in self._slot_of:
-            return casadi.OP_INPUT, [], SHARED
+            return casadi.OP_INPUT, []
         if all(k in self.graph.constants for k in group):
-            return casadi.OP_CONST, [], SHARED
+            return casadi.OP_CONST, []
         if len({ops[k] for k in group}) == 1 and ops[first] not in NO_OPERATION:
-            return ops[first], self._operands(group), SHARED
-        return BY_LIMB, [(k,) * self.n for k in group], SHARED
+            return ops[first], self._operands(group)
+        return BY_LIMB, [(k,) * self.n for k in group]
 
     def _operands(self, group: Group) -> list[Group]:
         """Return the groups of operands of nodes with the same operation."""
@@ -364,6 +352,6 @@ class _Folding:
 
     def _likeness(self, a: int, b: int) -> int:
         """Return how well a node fits another one as its counterpart."""
-        if a == b or a in self.homes and self.homes[a] is self.homes.get(b):
+        if a == b or (a in self.homes and self.homes[a] is self.homes.get(b)):
             return 2
         return int(self._shapes[a] == self._shapes[b])

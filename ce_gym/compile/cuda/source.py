@@ -18,8 +18,8 @@ from typing import Any
 import casadi
 import numpy as np
 
-from ce_gym.compile.cuda.prelude import prelude
 from ce_gym.compile.cuda.limbs import Group, Slots, fold, limb_slots, lower_limb
+from ce_gym.compile.cuda.prelude import prelude
 from ce_gym.compile.cuda.writer import Writer
 from ce_gym.compile.layout import Layout, layout_of
 from ce_gym.compile.lowering.function import Arguments, lower_function, variants_of
