@@ -61,7 +61,8 @@ TOGETHER = r"""
     { \
         EVERY(i) a.lane[i] = a.lane[i] SIGN b.lane[i]; \
         return a; \
-    }
+    } \
+    friend Lanes operator SIGN(Lanes a, int b) { return a SIGN Lanes<int>(b); }
 
 template <class T> struct Lanes {
     T lane[WARP];

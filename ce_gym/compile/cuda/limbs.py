@@ -64,22 +64,25 @@ class Folded:
 
 
 def limb_slots(stages: Sequence[Program]) -> Slots:
-    """Return the slots of all buffers of a program of which a thread should compute one limb, else nothing."""
-    (program, *others), calls = stages, [call for stage in stages for call in stage.calls]
-    plain = all(b.kind in ("tiles", "rows_in", "scratch") for b in program.buffers)
-    if others or program.skip_unless or not plain or not all(isinstance(call, Call) for call in calls):
+    """Return the slots of all buffers of stages of which a thread should compute one limb, else nothing."""
+    calls = [call for stage in stages for call in stage.calls if isinstance(call, Call)]
+    if stages[0].skip_unless or len(calls) < sum(len(stage.calls) for stage in stages):
         return {}
-    longest = max((call for call in calls if isinstance(call, Call)), key=lambda call: call.function.n_instructions())
+    longest = max(calls, key=lambda call: call.function.n_instructions())
     function = longest.function
-    slots = find_slots(function, longest.inputs, longest.outputs) if function.n_instructions() > SHORT else {}
+    slots = find_slots(function, longest.inputs) if function.n_instructions() > SHORT else {}
     if not slots:
         return {}
-    graph = graph_of(function)
-    n_operations = fold(function, graph, longest.inputs, dict(enumerate(longest.outputs)), slots).n_operations
-    if n_operations > MOST * Folded(graph).n_operations:
-        return {}
     n = len(slots[longest.inputs[0]][0])
-    return {b.name: slots.get(b.name) or _slots(b.size, n, ()) for b in program.buffers}
+    sizes = {b.name: b.size for stage in stages for b in stage.buffers}
+    for call in dict.fromkeys((longest, *calls)):
+        known = {name: slots.get(name) or _slots(sizes[name], n, ()) for name in call.inputs}
+        folding = _Folding(call.function, graph_of(call.function), call.inputs, known, n)
+        slots |= {name: folding.slots_of(i) for i, name in enumerate(call.outputs) if name not in slots}
+    graph, outputs = graph_of(function), dict(enumerate(longest.outputs))
+    if fold(function, graph, longest.inputs, outputs, slots).n_operations > MOST * Folded(graph).n_operations:
+        return {}
+    return {name: slots.get(name) or _slots(size, n, ()) for name, size in sizes.items()}
 
 
 def lower_limb(v: Any, folded: Folded, arguments: Arguments) -> None:
@@ -115,8 +118,8 @@ def lower_limb(v: Any, folded: Folded, arguments: Arguments) -> None:
         v.store(values.get(k) or value(k), arguments.outputs[number], slot)
 
 
-def find_slots(function: casadi.Function, inputs: Sequence[str], outputs: Sequence[str]) -> dict[str, list[Group]]:
-    """Return the slots of the buffers of a function whose trace has equal limbs, else nothing.
+def find_slots(function: casadi.Function, inputs: Sequence[str]) -> dict[str, list[Group]]:
+    """Return the slots of the inputs of a function whose trace has equal limbs, else nothing.
 
     Two elements of an input have the same role if they are used in the same way. Elements of different roles belong to
     one limb if an operation depends on them, and not on more elements of a role than a limb has.
@@ -124,7 +127,6 @@ def find_slots(function: casadi.Function, inputs: Sequence[str], outputs: Sequen
     Args:
         function: The traced function.
         inputs: Names of the buffers of its inputs.
-        outputs: Names of the buffers of its outputs.
     """
     graph = instructions_of(function)
     elements = _elements(function, graph)
@@ -143,12 +145,6 @@ def find_slots(function: casadi.Function, inputs: Sequence[str], outputs: Sequen
     for number, name in enumerate(inputs):
         of_input = [group for (at, _), of in groups.items() if at == number for group in zip(*of, strict=True)]
         slots[name] = _slots(function.numel_in(number), n, of_input)
-    folding = _Folding(function, graph_of(function), inputs, slots)
-    for number, name in enumerate(outputs):
-        if name not in slots:
-            nodes = folding.outputs[number]
-            homes = dict.fromkeys(folding.homes[k] for k in nodes if k in folding.homes)
-            slots[name] = _slots(len(nodes), n, [tuple(map(nodes.index, h)) for h in homes if set(h) <= set(nodes)])
     return slots
 
 
@@ -164,7 +160,7 @@ def fold(
         outputs: Names of the buffers of the outputs that are computed, by number.
         slots: Slots of all buffers.
     """
-    folding = _Folding(function, graph, inputs, slots)
+    folding = _Folding(function, graph, inputs, slots, len(next(iter(slots.values()))[0]))
     for number, name in outputs.items():
         for slot, places in enumerate(slots[name]):
             folding.folded.outputs[number, slot] = folding.add(tuple(folding.outputs[number][p] for p in places))
@@ -237,9 +233,9 @@ class _Folding:
         homes: For each node of a limb, the group of that node and its counterparts.
     """
 
-    def __init__(self, function: casadi.Function, graph: Graph, inputs: Sequence[str], slots: Slots) -> None:
+    def __init__(self, function: casadi.Function, graph: Graph, inputs: Sequence[str], slots: Slots, n: int) -> None:
         self.graph, self.folded = Graph(list(graph.ops), list(graph.operands), dict(graph.constants)), Folded()
-        self.n = len(next(iter(slots.values()))[0])
+        self.n = n
         self._made: dict[Group, int] = {}
         zero = self.graph.add(casadi.OP_CONST)
         self.graph.constants[zero] = 0.0
@@ -298,6 +294,13 @@ class _Folding:
                 for home in zip(*nodes, strict=True):
                     limb_of |= {k: limb for limb, k in enumerate(home)}
                     self.homes |= dict.fromkeys(home, home)
+
+    def slots_of(self, number: int) -> list[Group]:
+        """Return slots of an output in which elements of limbs are where they are computed."""
+        nodes = self.outputs[number]
+        homes = dict.fromkeys(self.homes[k] for k in nodes if k in self.homes)
+        groups = [tuple(map(nodes.index, home)) for home in homes if set(home) <= set(nodes)]
+        return _slots(len(nodes), self.n, groups)
 
     def add(self, group: Group) -> int:
         """Return the node of the result for a group of nodes, after adding that node and all that it needs."""

@@ -96,8 +96,8 @@ __device__ __forceinline__ word start_of(word key, word counter)
 template <int SIZE> __device__ __forceinline__ word draw(real* to, word state)
 {{
     for (int i = 0; i < SIZE; ++i) {{
-        state += {golden:#x}ull;
-        to[i] = real((long long)(mix(state) >> {shift})) * real({scale});
+        state = state + {golden:#x}ull;
+        to[i] = real((EACH(long long))(mix(state) >> {shift})) * real({scale});
     }}
     return state;
 }}

@@ -31,6 +31,8 @@ BLOCK, BLOCKS = 128, 2
 """Threads of a block, and blocks that fit on a multiprocessor, which allows 255 registers per thread.
 
 Without the second number the compiler uses 32 registers in long kernels and spills the other values."""
+KEYS = (("const ", "keys"), ("", "counters"))
+"""Arguments of kernels that draw random numbers."""
 LONG = 500
 """Functions with several callers and more instructions are called; others are inlined."""
 ENTRY = "run"
@@ -122,7 +124,7 @@ class _KernelText:
             const = "" if b.name in self.layout.written else "const "
             arguments.append(f"{const}{C_TYPES[b.dtype or self.layout.dtype]}* __restrict__ all_{b.name}")
         if self.layout.is_random:
-            arguments += ["const word* __restrict__ keys", "word* __restrict__ counters"]
+            arguments += [f"{const}unsigned long long* __restrict__ {name}" for const, name in KEYS]
         arguments += [f"int {side}_{name}" for name in self.layout.shapes for side in ("rows", "columns")]
         arguments += [f"int times_{name}" for name in self.layout.repeats] + ["int count"]
         return (
@@ -145,7 +147,7 @@ class _KernelText:
             if b.kind == "rows_in":
                 yield f"read_row<{b.size}>({b.name}_, all_{b.name}, lane);"
         if self.layout.is_random:
-            yield "word counter = counters[lane];"
+            yield f"word counter = {self._read('counters')};"
 
     def end(self) -> Iterator[str]:
         """Yield the lines that store changed values."""
@@ -173,7 +175,7 @@ class _KernelText:
         drawn = [b for b in stage.buffers if b.kind == "random"]
         if drawn:
             yield "{"
-            yield "    word state = start_of(keys[lane], counter);"
+            yield f"    word state = start_of({self._read('keys')}, counter);"
             for b in drawn:
                 yield f"    state = draw<{b.size}>({b.name}_, state);"
             yield "}"
@@ -265,6 +267,10 @@ class _KernelText:
         """Return the condition that a flag is not zero."""
         return f"{flag}_[0] != 0"
 
+    def _read(self, words: str) -> str:
+        """Return the word of the robot in an array of words."""
+        return f"{words}[lane]"
+
     def _function_text(self, name: str, function: casadi.Function, inline: str, fragment: Fragment | None) -> str:
         """Return a traced function in C. Loads precede stores, so that an output may be the array of an input."""
         inputs = [f"in{i}" for i in range(function.n_in())]
@@ -300,24 +306,51 @@ class _LimbText(_KernelText):
         """Yield the lines that find the limb and load its values; surplus threads repeat the last robot."""
         yield f"const word robots = count, thread = word(blockIdx.x) * {BLOCK} + threadIdx.x;"
         yield f"const word limb = thread % {self.threads}, robot = thread / {self.threads};"
-        yield "const mask is_robot = robot < robots, is_first = is_robot & (limb == 0);"
+        yield "const mask is_robot = robot < robots;"
         yield "const word lane = choose<word>(is_robot, robot, robots - 1);"
         for b in self.program.buffers:
             yield f"real {b.name}_[{len(self.slots[b.name])}];"
             if b.kind in ("tiles", "rows_in"):
                 for slot, places in enumerate(self.slots[b.name]):
                     yield f"{b.name}_[{slot}] = real(fetch(all_{b.name}, {_index(b, places)}));"
+        if self.layout.is_random:
+            yield f"word counter = {self._read('counters')};"
 
     def end(self) -> Iterator[str]:
-        """Yield the lines that store changed values."""
+        """Yield the lines that store changed values that are not rows."""
         for b in self.program.buffers:
-            if b.kind == "rows_out" or (b.kind == "tiles" and b.name in self.layout.written):
-                for slot, places in enumerate(self.slots[b.name]):
-                    yes = "is_first" if len(set(places)) == 1 else "is_robot"
-                    yield f"put({yes}, all_{b.name}, {_index(b, places)}, {b.name}_[{slot}]);"
+            if b.kind == "tiles" and b.name in self.layout.written:
+                yield from self._store(b, "is_robot")
+        if self.layout.is_random:
+            yield "put(is_robot & (limb == 0), counters, lane, counter);"
+
+    def stage(self, stage: Program, *, first: bool) -> Iterator[str]:
+        """Yield the lines of one program, which a warp skips if no robot needs it, and stores of rows.
+
+        As in tiles of the CPU, the program changes nothing but rows for robots that do not need it.
+        """
+        flag = "" if first else stage.skip_unless
+        yield f"if ({self._is_set(flag)}) {{" if flag else "{"
+        yield f"    const mask is_in = is_robot & ({flag}_[0] != 0);" if flag else "    const mask is_in = is_robot;"
+        yield from _indented([*self._draws(stage), *self._steps(stage.steps)])
+        for b in stage.buffers:
+            if b.kind == "rows_out":
+                yield from _indented(self._store(b, "is_in"))
+        if self.layout.is_random:
+            yield "    counter = choose<word>(is_in, counter + 1, counter);"
+        yield "}"
+
+    def _store(self, buffer: Buffer, condition: str) -> Iterator[str]:
+        """Yield the lines that store a buffer of robots that meet a condition; the first limb stores shared values."""
+        for slot, places in enumerate(self.slots[buffer.name]):
+            yes = f"{condition} & (limb == 0)" if len(set(places)) == 1 else condition
+            yield f"put({yes}, all_{buffer.name}, {_index(buffer, places)}, {buffer.name}_[{slot}]);"
 
     def _is_set(self, flag: str) -> str:
         return f"any({super()._is_set(flag)})"
+
+    def _read(self, words: str) -> str:
+        return f"fetch({words}, lane)"
 
     def _lower(self, writer: Any, function: casadi.Function, arguments: Arguments, fragment: Fragment | None) -> None:
         call, graph = self.calls[function], fragment.graph if fragment else graph_of(function)
