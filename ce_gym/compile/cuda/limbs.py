@@ -77,11 +77,11 @@ def limb_slots(stages: Sequence[Program]) -> Slots:
     sizes = {b.name: b.size for stage in stages for b in stage.buffers}
     for call in dict.fromkeys((longest, *calls)):
         known = {name: slots.get(name) or _slots(sizes[name], n, ()) for name in call.inputs}
-        folding = _Folding(call.function, graph_of(call.function), call.inputs, known, n)
+        folding = _Folding(call, graph_of(call.function), known, n)
         slots |= {name: folding.slots_of(i) for i, name in enumerate(call.outputs) if name not in slots}
-    graph, outputs = graph_of(function), dict(enumerate(longest.outputs))
-    if fold(function, graph, longest.inputs, outputs, slots).n_operations > MOST * Folded(graph).n_operations:
-        return {}
+        graph = folding.graph
+        if call is longest and fold(call, graph, slots).n_operations > MOST * Folded(graph).n_operations:
+            return {}
     return {name: slots.get(name) or _slots(size, n, ()) for name, size in sizes.items()}
 
 
@@ -132,15 +132,18 @@ def find_slots(function: casadi.Function, inputs: Sequence[str]) -> dict[str, li
     elements = _elements(function, graph)
     uses = _uses(function, graph)
     counts = Counter(uses.values())
-    n = max(COUNTS, key=lambda count: sum(size for size in counts.values() if size == count))
-    roles = {k: use for k, use in uses.items() if counts[use] % n == 0}
-    limb_of = _limbs(graph, roles, elements, n)
+    limbs = {}
+    for n in COUNTS:
+        roles = {k: use for k, use in uses.items() if counts[use] % n == 0}
+        limbs[n] = _limbs(graph, roles, elements, n)
+    n = max(COUNTS, key=lambda n: len(limbs[n]) * (1 - 1 / n))
+    limb_of = limbs[n]
     if not limb_of:
         return {}
     groups: dict[tuple[int, int], list[list[int]]] = defaultdict(lambda: [[] for _ in range(n)])
     for k in sorted(limb_of, key=lambda k: elements[k]):
         number, position = elements[k]
-        groups[number, roles[k]][limb_of[k]].append(position)
+        groups[number, uses[k]][limb_of[k]].append(position)
     slots = {}
     for number, name in enumerate(inputs):
         of_input = [group for (at, _), of in groups.items() if at == number for group in zip(*of, strict=True)]
@@ -148,21 +151,18 @@ def find_slots(function: casadi.Function, inputs: Sequence[str]) -> dict[str, li
     return slots
 
 
-def fold(
-    function: casadi.Function, graph: Graph, inputs: Sequence[str], outputs: Mapping[int, str], slots: Slots
-) -> Folded:
+def fold(call: Call, graph: Graph, slots: Slots, numbers: Iterable[int] | None = None) -> Folded:
     """Return the operations of a thread for a function, or for a fragment of the function.
 
     Args:
-        function: The traced function.
+        call: A call of the function.
         graph: The graph of the function, or of the fragment.
-        inputs: Names of the buffers of the inputs.
-        outputs: Names of the buffers of the outputs that are computed, by number.
         slots: Slots of all buffers.
+        numbers: Numbers of the outputs that are computed; all of them if None.
     """
-    folding = _Folding(function, graph, inputs, slots, len(next(iter(slots.values()))[0]))
-    for number, name in outputs.items():
-        for slot, places in enumerate(slots[name]):
+    folding = _Folding(call, graph, slots, len(next(iter(slots.values()))[0]))
+    for number in range(len(call.outputs)) if numbers is None else numbers:
+        for slot, places in enumerate(slots[call.outputs[number]]):
             folding.folded.outputs[number, slot] = folding.add(tuple(folding.outputs[number][p] for p in places))
     return folding.folded
 
@@ -212,8 +212,12 @@ def _limbs(graph: Graph, roles: Mapping[int, int], elements: Mapping[int, tuple[
     most = {role: count // n for role, count in Counter(roles.values()).items()}
     part_of = {k: frozenset((k,)) for k in roles}
     needs: list[frozenset[int]] = []
+    known: set[frozenset[int]] = set()
     for k, operands in enumerate(graph.operands):
         needs.append(frozenset((k,) if k in roles else ()).union(*(needs[a] for a in operands)))
+        if needs[k] in known:
+            continue
+        known.add(needs[k])
         union = frozenset[int]().union(*(part_of[a] for a in needs[k]))
         counts = Counter(roles[a] for a in union)
         if all(counts[role] <= most[role] for role in counts):
@@ -233,7 +237,8 @@ class _Folding:
         homes: For each node of a limb, the group of that node and its counterparts.
     """
 
-    def __init__(self, function: casadi.Function, graph: Graph, inputs: Sequence[str], slots: Slots, n: int) -> None:
+    def __init__(self, call: Call, graph: Graph, slots: Slots, n: int) -> None:
+        function = call.function
         self.graph, self.folded = Graph(list(graph.ops), list(graph.operands), dict(graph.constants)), Folded()
         self.n = n
         self._made: dict[Group, int] = {}
@@ -248,7 +253,7 @@ class _Folding:
         node_at = {place: k for k, place in _elements(function, graph).items()}
         self._slot_of: dict[Group, tuple[int, int]] = {}
         self.homes: dict[int, Group] = {}
-        for number, name in enumerate(inputs):
+        for number, name in enumerate(call.inputs):
             for slot, places in enumerate(slots[name]):
                 group = tuple(node_at.get((number, p), -1) for p in places)
                 self._slot_of[group] = number, slot

@@ -354,9 +354,7 @@ class _LimbText(_KernelText):
 
     def _lower(self, writer: Any, function: casadi.Function, arguments: Arguments, fragment: Fragment | None) -> None:
         call, graph = self.calls[function], fragment.graph if fragment else graph_of(function)
-        numbers = sorted(fragment.outputs) if fragment else range(function.n_out())
-        outputs = {number: call.outputs[number] for number in numbers}
-        folded = fold(function, graph, call.inputs, outputs, self.slots)
+        folded = fold(call, graph, self.slots, sorted(fragment.outputs) if fragment else None)
         for bit in range(self.threads.bit_length() - 1):
             writer.lines.append(f"const mask limb_{2**bit} = (limb & {2**bit}) != 0;")
         lower_limb(writer, folded, arguments)
