@@ -19,8 +19,8 @@ needs_host_compiler = pytest.mark.skipif(host_compiler() is None, reason="no C++
 needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU here")
 
 
-def make(device, **options):
-    return gymnasium.make_vec(ID, num_envs=N, robot=TRIPOD, autoreset_mode="SameStep", device=device, **options)
+def make(device, robot=TRIPOD, **options):
+    return gymnasium.make_vec(ID, num_envs=N, robot=robot, autoreset_mode="SameStep", device=device, **options)
 
 
 def numbers(value):
@@ -157,6 +157,12 @@ def test_a_whole_environment_compiles_for_a_gpu():
     _, usage = nvrtc.compile_cubin(source.text, "sm_90")
     assert 128 < usage.registers <= 255
     assert usage.spill_loads < 8000
+
+
+@needs_host_compiler
+def test_one_limb_per_thread_steps_like_the_processor():
+    _, _, ended = run_both(Emulated(), robot="mini_cheetah", max_episode_steps=7)
+    assert ended > N
 
 
 @needs_gpu

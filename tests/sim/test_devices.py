@@ -36,7 +36,9 @@ def assert_same(one, other):
 
 @needs_host_compiler
 @pytest.mark.parametrize(
-    ("robot", "dtype"), [(TRIPOD, "float32"), *((name, "float64") for name in (TRIPOD, "six_bar", "mit_humanoid_leg"))]
+    ("robot", "dtype"),
+    [(TRIPOD, "float32"), ("mini_cheetah", "float32")]
+    + [(name, "float64") for name in (TRIPOD, "six_bar", "mit_humanoid_leg")],
 )
 def test_the_same_numbers(robot, dtype):
     model = ce_gym.Model(robot)

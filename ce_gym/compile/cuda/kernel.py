@@ -13,7 +13,7 @@ Launcher = Callable[[Sequence[int], Sequence[int], int], None]
 
 
 class CudaKernel:
-    """Machine code that processes robots, with a thread for each.
+    """Machine code that processes robots, with one or more threads for each.
 
     Args:
         source: source of the machine code.

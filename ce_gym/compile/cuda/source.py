@@ -1,4 +1,4 @@
-"""A kernel in CUDA C: one thread is one robot, whose values are local arrays from its first load to its last store.
+"""A kernel in CUDA C: one thread is one robot or one limb, whose values are local arrays from first load to last store.
 
 A kernel is a list of programs, its stages, which run in order on every robot. So a whole environment step with resets
 is one launch. `tile` compiles the same programs for the CPU.
