@@ -158,7 +158,7 @@ def fold(call: Call, graph: Graph, slots: Slots, numbers: Iterable[int] | None =
         call: A call of the function.
         graph: The graph of the function, or of the fragment.
         slots: Slots of all buffers.
-        numbers: Numbers of the outputs that are computed; all of them if None.
+        numbers: Numbers of the computed outputs; all outputs if None.
     """
     folding = _Folding(call, graph, slots, len(next(iter(slots.values()))[0]))
     for number in range(len(call.outputs)) if numbers is None else numbers:
@@ -323,7 +323,7 @@ class _Folding:
         return self._made[group]
 
     def _describe(self, node: int, op: int, group: Group) -> None:
-        """Record what the operation of a new node does not say."""
+        """Record input, constants or limb of a new node."""
         folded, known = self.folded, self.graph.constants
         if op == FROM_LIMB:
             folded.limbs[node] = self.homes[group[0]].index(group[0]), self.n
