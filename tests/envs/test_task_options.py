@@ -8,6 +8,8 @@ import pytest
 from tripod import TRIPOD
 
 import ce_gym
+from ce_gym.envs.runtime.setup import make_program
+from ce_gym.envs.task.tasks import deployable
 
 VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
 
@@ -91,6 +93,16 @@ def test_history_shows_the_newest_first():
     third, *_ = envs.step(zeros(envs))
     np.testing.assert_array_equal(third[:, size : 2 * size], second[:, :size])
     np.testing.assert_array_equal(third[:, 2 * size :], first[:, :size])
+
+
+def test_deployable_observations_are_those_of_the_task_without_unmeasured_ones():
+    observed = {robot: make_program(robot, "velocity", observations="deployable") for robot in ("go2", "mit_humanoid")}
+    blocks = ["gyro", "projected_gravity", "velocity_command", "joint_positions", "joint_velocities", "last_action"]
+    assert list(observed["go2"].observation_sizes) == blocks
+    assert list(observed["mit_humanoid"].observation_sizes) == [*blocks, "gait_phase"]
+    named = {"base_height": {}, "joint_positions": {}, "base_angular_velocity": {"scale": 2.0}}
+    assert deployable(named) == {"joint_positions": {}, "gyro": {"scale": 2.0}}
+    assert deployable(("projected_gravity",)) == ("projected_gravity",)
 
 
 @pytest.mark.slow

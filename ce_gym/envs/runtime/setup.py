@@ -17,7 +17,7 @@ from ce_gym.envs.runtime.batch import TaskBatch
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.task.checks import merged_rewards
 from ce_gym.envs.task.skills import SKILLS
-from ce_gym.envs.task.tasks import TASKS, Task
+from ce_gym.envs.task.tasks import TASKS, Task, deployable
 from ce_gym.model.arguments import check, check_choice, check_whole
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, invalid_value, listed_names, unknown_name
@@ -144,7 +144,8 @@ def changed_task(task: Task, changes: Mapping[str, Any]) -> Task:
 
     Args:
         task: A task.
-        changes: New values by name of the field; lists, as in JSON, count as tuples, and None as no change.
+        changes: New values by name of the field; lists, as in JSON, count as tuples, and None as no change;
+            "deployable" as `observations` for the blocks that a robot can measure.
 
     Raises:
         UnknownArgument: If a field does not exist.
@@ -152,6 +153,8 @@ def changed_task(task: Task, changes: Mapping[str, Any]) -> Task:
     """
     check_fields(Task, changes, others=("rewards",))
     given = {name: value for name, value in changes.items() if value is not None}
+    if given.get("observations") == "deployable":
+        given["observations"] = deployable(task.observations)
     for each in fields(Task):
         if each.metadata.get("merges") and each.name in given:
             given[each.name] = {**getattr(task, each.name), **each.metadata["check"](each.name, given[each.name])}

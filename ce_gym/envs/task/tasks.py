@@ -39,7 +39,8 @@ class Task(SceneOptions):
     Attributes:
         rewards: Weight of each reward term, or a mapping of `weight` and parameters, by the name of its function; the
             reward is the weighted sum times the control step.
-        observations: Observation blocks, in order: names, or parameters by name.
+        observations: Observation blocks, in order: names, or parameters by name. As an argument also "deployable": the
+            blocks of the task that a robot can measure, see `deployable`.
         terminations: Conditions that end an episode as a failure, as names or parameters by name; contacts that they
             read need not be in `contacts`.
         metrics: Figures averaged over each episode, as names or parameters by name.
@@ -100,6 +101,19 @@ class Task(SceneOptions):
     only_positive: bool = option(flag, True)
     reset_noise: Mapping[str, float] = option(magnitudes(RESET_NOISE), RESET_NOISE, merges=True)
     start: Mapping[str, Range] = option(ranges(STARTS), {})
+
+
+NOT_MEASURED = ("base_linear_velocity", "base_height", "contact_forces", "parameters")
+"""Observation blocks that no sensor of a robot provides."""
+
+
+def deployable(observations: Terms) -> Terms:
+    """Return the observation blocks that a robot can measure, with "gyro" in place of "base_angular_velocity"."""
+    names = {name: name for name in observations if name not in NOT_MEASURED}
+    names |= {"base_angular_velocity": "gyro"} if "base_angular_velocity" in names else {}
+    if isinstance(observations, Mapping):
+        return {new: observations[old] for old, new in names.items()}
+    return tuple(names.values())
 
 
 RANDOMISED = {
