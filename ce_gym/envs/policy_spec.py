@@ -16,7 +16,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
 
-FORMAT = "ce_gym policy specification, version 1"
+FORMAT = "ce_gym policy specification, version 2"
 
 MEANINGS = {
     "joint_pd": "joint target [rad] = default_pose + scale * clip(action, -1, 1); torque = kp * (target - position) "
@@ -35,8 +35,13 @@ COORDINATES = {
     "velocities of ball joints in axes of the moving body (3 each), joints [rad/s]",
     "command": "forward and sideways velocity in the base frame [m/s], yaw rate [rad/s]",
     "action": "the action before this observation, after clipping",
+    "gravity": "direction of gravity in the base frame (3); (0, 0, -1) if upright",
+    "gait": "sine and cosine of 2 pi t / gait_period, where t is the time since the first observation [s]",
 }
 """Sources of the numbers of an observation, by the name in its blocks."""
+
+OF_BLOCKS = {"projected_gravity": "gravity", "gait_phase": "gait"}
+"""Blocks that have a source of their own."""
 
 
 def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
@@ -50,6 +55,7 @@ def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
         JSON-able data. `joints`, `default_pose` [rad], `kp` [N m/rad], `kd` [N m s/rad] and `torque_limits` [N m] share
         one order. An observation is the sequence of `observation["blocks"]`. Entry i of a block with a source `of`, one
         of `coordinates`, is `offset[i] + scale[i] * of[rows[i]]`. The key `meaning` describes all other blocks.
+        `latency` [s] is the range in training of the time from measurement to command.
     """
     robot, chosen = program.model.robot, program.task
     joints = robot.commanded
@@ -69,6 +75,8 @@ def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
         "standing_height": float(robot.pose.height),
         "control_dt": program.control_dt,
         "physics_dt": chosen.dt,
+        "latency": [steps * chosen.dt for steps in chosen.latency],
+        "gait_period": chosen.gait_period,
         "action": _action(program),
         "observation": {
             "size": program.observation_size,
@@ -107,8 +115,11 @@ def _blocks(program: TaskProgram) -> list[dict[str, Any]]:
     for name, size in program.observation_sizes.items():
         document = inspect.getdoc(program.observation_terms[name].function) or ""
         noise = {"noise": program.task.noise[name]} if program.task.noise.get(name) else {}
-        meaning = " ".join(document.split())
-        blocks.append({"name": name, "size": size, "meaning": meaning, **_source(values[name], state), **noise})
+        meaning = " ".join(document.split("\n\n")[0].split())
+        source = _source(values[name], state)
+        if name in OF_BLOCKS:
+            source = {"of": OF_BLOCKS[name], "rows": [*range(size)], "scale": [1.0] * size, "offset": [0.0] * size}
+        blocks.append({"name": name, "size": size, "meaning": meaning, **source, **noise})
     return blocks
 
 

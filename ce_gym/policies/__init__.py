@@ -5,10 +5,12 @@ from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.arguments import add_env_arg, add_env_arguments, checked_arguments, parse_yaml
 from ce_gym.policies.environments import environment_of, import_module_of, registered
 from ce_gym.policies.errors import LevelWarning, PolicyError
+from ce_gym.policies.exports import export_policy
 from ce_gym.policies.files import load_policy, read_actor, write_npz
 from ce_gym.policies.height_maps import keep_map, with_map
 from ce_gym.policies.places import WHERE, find_policy, locate_policy, shelf, shipped_policies
 from ce_gym.policies.records import RECORD_KEY, environment_record
+from ce_gym.policies.robot_data import observation_in_words
 from ce_gym.policies.saving import save
 from ce_gym.policies.weights import read_weights
 
@@ -25,12 +27,14 @@ __all__ = [
     "checked_arguments",
     "environment_of",
     "environment_record",
+    "export_policy",
     "find_policy",
     "import_module_of",
     "keep_map",
     "listed_names",
     "load_policy",
     "locate_policy",
+    "observation_in_words",
     "parse_yaml",
     "read_actor",
     "read_weights",

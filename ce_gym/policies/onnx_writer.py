@@ -2,13 +2,11 @@
 
 The network takes observations `obs` (n, n_obs) and returns clipped mean actions `actions` (n, n_actions). The metadata
 of the file contains the record of the policy with its specification: joint order, default pose, meaning of actions,
-blocks of an observation, gains, time steps, robot, task and transmission level.
+blocks of an observation, gains, time steps, robot, task and transmission level; and mjlab's keys.
 """
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,34 +16,10 @@ from onnx import TensorProto, compose, helper, numpy_helper
 
 from ce_gym.policies.actor import Actor
 from ce_gym.policies.errors import PolicyError
-from ce_gym.policies.files import load_policy, read_actor
-from ce_gym.policies.places import locate_policy
-from ce_gym.policies.records import RECORD_KEY
+from ce_gym.policies.robot_data import metadata
 
 OPSET, IR_VERSION = 17, 8
 """Old versions, for the runtimes on robots."""
-
-
-def export_policy(path: str | Path, out: Path) -> None:
-    """Write a policy as ONNX to `out`, and its specification beside it as JSON.
-
-    Only weights and the record are read from the policy; no pickled code is run.
-
-    Args:
-        path: See `ce_gym.load_policy`.
-        out: The ONNX file; the suffix of the specification is `.json`.
-
-    Raises:
-        PolicyError: If the policy cannot be read, or a file cannot be written.
-    """
-    file = locate_policy(path)
-    if file.suffix == ".onnx":
-        record = load_policy(file).record
-        model = onnx.load(file, load_external_data=False)
-    else:
-        actor, record = read_actor(file)
-        model = to_onnx(actor, record)
-    write_onnx(model, record, out)
 
 
 def to_onnx(actor: Actor, record: dict[str, Any]) -> onnx.ModelProto:
@@ -105,8 +79,7 @@ def complete(network: onnx.ModelProto, record: dict[str, Any], normalisation: ND
         sparse_initializer=graph.sparse_initializer,
     )
     model.graph.CopyFrom(graph)
-    entries = {RECORD_KEY: record, **record["policy_spec"]}
-    helper.set_model_props(model, {k: x if isinstance(x, str) else json.dumps(x) for k, x in entries.items()})
+    helper.set_model_props(model, metadata(record))
     onnx.checker.check_model(model, full_check=True)
     return model
 
@@ -118,16 +91,3 @@ def _constant(name: str, value: NDArray | float) -> onnx.TensorProto:
 def _rows(name: str, size: int | None) -> onnx.ValueInfoProto:
     """Return the description of an array (n, size)."""
     return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", size])
-
-
-def write_onnx(model: onnx.ModelProto, record: dict[str, Any], out: Path) -> None:
-    """Write a model to `out`, and the specification of the policy beside it as JSON.
-
-    Raises:
-        PolicyError: If a file cannot be written.
-    """
-    try:
-        onnx.save(model, out)
-        out.with_suffix(".json").write_text(json.dumps(record["policy_spec"], indent=2) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise PolicyError(f"{out}: cannot be written: {error.strerror}") from None

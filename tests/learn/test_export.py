@@ -1,6 +1,9 @@
 """Policies as files: commands take saved policies, and a specification describes their observations."""
 
+import ctypes
 import json
+import shutil
+import subprocess
 from pathlib import Path
 
 import gymnasium
@@ -10,7 +13,9 @@ from point_mass import ID
 
 import ce_gym
 from ce_gym.__main__ import main
-from ce_gym.policies import ACTIVATIONS, load_policy, save
+from ce_gym.model.frames import rotation_matrix
+from ce_gym.policies import ACTIVATIONS, Actor, load_policy, read_actor, save, write_npz
+from ce_gym.policies.exports import WITHOUT_SOURCES
 
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
@@ -76,6 +81,7 @@ def test_the_specification_rebuilds_observations():
         obs, *_ = envs.step(action)
     state = {**envs.state(), "action": action}
     np.testing.assert_array_equal(envs.look(state)[0], obs)
+    state["gravity"] = -rotation_matrix(state["q"][:, 3:7])[:, 2]
     start, found = 0, 0
     for block in envs.policy_spec()["observation"]["blocks"]:
         rows = slice(start, start + block["size"])
@@ -85,13 +91,94 @@ def test_the_specification_rebuilds_observations():
             np.testing.assert_allclose(rebuilt, obs[:, rows], atol=1e-6)
             found += block["size"]
     assert start == obs.shape[1]
-    assert found == start - 3  # all but the direction of gravity
+    assert found == start
+
+
+def test_the_gait_clock_of_the_specification():
+    envs = gymnasium.make_vec("ce_gym/MitHumanoidVelocity-v0", 2, observations=["gait_phase"]).unwrapped
+    envs.reset(seed=0)
+    spec = envs.policy_spec()
+    assert spec["observation"]["blocks"][0]["of"] == "gait"
+    for step in range(1, 4):
+        obs, *_ = envs.step(np.zeros(envs.action_space.shape, np.float32))
+        phase = 2 * np.pi * step * spec["control_dt"] / spec["gait_period"]
+        np.testing.assert_allclose(obs, np.tile([np.sin(phase), np.cos(phase)], (2, 1)), atol=1e-6)
+
+
+def test_latency_is_in_seconds():
+    envs = gymnasium.make_vec(ROBOT_ENV, 1, latency=(1, 3)).unwrapped
+    assert envs.policy_spec()["latency"] == pytest.approx([0.005, 0.015])
 
 
 def test_looking_needs_all_that_is_looked_at():
     envs = gymnasium.make_vec(ROBOT_ENV, 2).unwrapped
     with pytest.raises(ValueError, match="the state lacks command"):
         envs.look({"q": np.zeros((2, 19)), "v": np.zeros((2, 18)), "action": np.zeros((2, 12))})
+
+
+def test_metadata_has_the_keys_of_mjlab(tmp_path):
+    command("export", saved(tmp_path / "walk.npz", ROBOT_ENV), "--out", tmp_path / "out.onnx", tmp_path / "out.pt")
+    spec, extra = json.loads((tmp_path / "out.json").read_text()), dict.fromkeys(("joint_names", "action_scale"), "")
+    found = {entry.key: entry.value for entry in onnx.load(tmp_path / "out.onnx").metadata_props}
+    assert found["joint_names"].split(",") == spec["joints"]
+    expected = {"joint_stiffness": spec["kp"], "joint_damping": spec["kd"], "default_joint_pos": spec["default_pose"]}
+    expected["action_scale"] = spec["action"]["scale"]
+    for key, numbers in expected.items():
+        np.testing.assert_array_equal([float(x) for x in found[key].split(",")], numbers)
+    assert found["observation_names"].split(",") == [block["name"] for block in spec["observation"]["blocks"]]
+    assert found["command_names"] == "velocity_command"
+    torch.jit.load(tmp_path / "out.pt", _extra_files=extra)
+    assert {key: x.decode() for key, x in extra.items()} == {key: found[key] for key in extra}
+
+
+def compiled_act(header: Path):
+    """Return `policy_act` of a header as a function of observations (n, n_obs)."""
+    compiler = shutil.which("cc") or pytest.skip("needs a C compiler")
+    source, library = header.with_suffix(".c"), header.with_suffix(".so")
+    source.write_text(f'#include "{header.name}"\nvoid act(const float *x, float *y) {{ policy_act(x, y); }}\n')
+    options = ["-std=c99", "-O2", "-Wall", "-Wno-unused", "-Wno-unused-const-variable", "-Werror", "-shared", "-fPIC"]
+    subprocess.run([compiler, *options, source, "-o", library, "-lm"], check=True)
+    function = ctypes.CDLL(str(library)).act
+
+    def act(observations):
+        rows, pointer = np.ascontiguousarray(observations, np.float32), ctypes.POINTER(ctypes.c_float)
+        actions = np.zeros((len(rows), 12), np.float32)
+        for x, y in zip(rows, actions, strict=True):
+            function(x.ctypes.data_as(pointer), y.ctypes.data_as(pointer))
+        return actions
+
+    return act
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("normalised", [False, True])
+def test_every_format_acts_as_the_policy(activation, normalised, tmp_path):
+    rng = np.random.default_rng(0)
+    obs = 3 * rng.standard_normal((200, 48)).astype(np.float32)
+    layers = tuple(
+        (rng.standard_normal((n, m)) / 4, rng.standard_normal(n) / 4) for m, n in ((48, 16), (16, 16), (16, 12))
+    )
+    rows = np.stack([np.full(48, 0.3), np.full(48, 2.0), np.full(48, 1.0)]) if normalised else None
+    actor = Actor(layers, activation, rows)
+    policy = save(actor, gymnasium.make_vec(ROBOT_ENV, 1, vectorization_mode="vector_entry_point"), tmp_path / "w.npz")
+    expected = load_policy(policy).predict(obs)[0]
+    assert np.ptp(expected) > 0.5
+    outs = [tmp_path / f"out{suffix}" for suffix in (".onnx", ".pt", ".h", ".npz")]
+    assert command("export", policy, "--out", *outs) == 0
+    scripted = torch.jit.load(outs[1])
+    acts = [load_policy(outs[0]).act, lambda x: scripted(torch.from_numpy(x)).numpy(), compiled_act(outs[2])]
+    for act in (*acts, load_policy(outs[3]).act):
+        np.testing.assert_allclose(act(obs), expected, rtol=0, atol=1e-5)
+
+
+def test_an_older_policy_gets_sources_and_names_of_joints(tmp_path):
+    policy = saved(tmp_path / "walk.npz", ROBOT_ENV)
+    actor, record = read_actor(policy)
+    spec = record["policy_spec"]
+    old = {**spec, "format": WITHOUT_SOURCES, "joints": ["link"] * 12}
+    write_npz(actor, {**record, "policy_spec": old}, policy)
+    assert command("export", policy, "--out", tmp_path / "out.h") == 0
+    assert json.loads((tmp_path / "out.json").read_text()) == spec
 
 
 def test_an_episode_that_ends_is_seen_to_end():
@@ -137,6 +224,10 @@ def test_mistakes_are_one_line(tmp_path, capsys):
         (["export", tmp_path / "missing.zip"], "missing.zip: no such policy"),
         (["export", path, "--out", path.with_suffix(".onnx")], "not the policy's own"),
         (["export", path, "--out", tmp_path / "nowhere" / "out.onnx"], "cannot be written"),
+        (
+            ["export", path, "--out", tmp_path / "out.tflite"],
+            "expected a name that ends in one of .onnx, .pt, .h",
+        ),
         (["card", path], "policy.npz: resumed_from: missing; expected a policy that `python -m ce_gym train` wrote"),
         (["export", tmp_path / "not.onnx"], "not.onnx: not an ONNX file"),
         (["export", tmp_path / "walk.zip"], "walk.json: no such file: an archive of Stable-Baselines3"),

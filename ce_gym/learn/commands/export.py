@@ -8,7 +8,7 @@ from typing import Any
 
 from ce_gym.console import add_command
 from ce_gym.learn.commands.errors import in_one_line
-from ce_gym.policies import WHERE, PolicyError, locate_policy, shelf
+from ce_gym.policies import WHERE, PolicyError, export_policy, locate_policy, observation_in_words, shelf
 
 
 def add_export_command(subparsers: Any) -> None:
@@ -16,27 +16,30 @@ def add_export_command(subparsers: Any) -> None:
     parser = add_command(
         subparsers,
         export,
-        "write a policy as ONNX, for a robot's computer",
-        "Write a trained policy as ONNX, and its specification beside it as JSON.",
+        "write a policy as ONNX, TorchScript, C or numpy, for a robot's computer",
+        "Write a trained policy as ONNX (.onnx), TorchScript (.pt), a header for C (.h) or numpy arrays (.npz), and "
+        "its specification beside it as JSON. Print the meaning of its observation.",
         "export runs/mini_cheetah_velocity",
-        "export tello_velocity --out walk.onnx",
+        "export tello_velocity --out walk.onnx walk.h",
     )
     parser.add_argument("policy", metavar="POLICY", help=WHERE)
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE", help="default: exported.onnx beside the policy; <name>.onnx here if shipped"
+    text = (
+        "files, with the suffix of their format (default: exported.onnx beside the policy; <name>.onnx here if shipped)"
     )
+    parser.add_argument("--out", type=Path, nargs="+", metavar="FILE", help=text)
 
 
 @in_one_line
 def export(args: argparse.Namespace) -> int:
-    """Write the two files."""
-    from ce_gym.policies.onnx_writer import export_policy
-
+    """Write the files, and print their names and the meaning of an observation."""
     policy = locate_policy(args.policy)
     shipped = policy.is_relative_to(shelf())
-    out = args.out or (Path(f"{args.policy}.onnx") if shipped else policy.with_name("exported.onnx"))
-    if out.suffix != ".onnx" or out.with_suffix(".json") == policy.with_suffix(".json"):
-        raise PolicyError(f"{out}: expected a name that ends in .onnx and is not the policy's own")
-    export_policy(policy, out)
-    print(f"{out}\n{out.with_suffix('.json')}")
+    outs = args.out or [Path(f"{args.policy}.onnx") if shipped else policy.with_name("exported.onnx")]
+    for out in outs:
+        if out.with_suffix(".json") == policy.with_suffix(".json"):
+            raise PolicyError(f"{out}: expected a name that is not the policy's own")
+        spec = export_policy(policy, out)
+        print(f"{out}\n{out.with_suffix('.json')}")
+        if out is outs[-1] and "observation" in spec:
+            print("Observation:", *observation_in_words(spec), sep="\n")
     return 0

@@ -1,0 +1,94 @@
+"""Write policies in the formats of programs on robots.
+
+| suffix  | content                                                                  | needs |
+|---------|--------------------------------------------------------------------------|-------|
+| `.onnx` | network with the specification and mjlab's keys in its metadata          | onnx  |
+| `.pt`   | network as TorchScript, with the same data in its extra files            | torch |
+| `.h`    | weights, network and specification as a header for C                     |       |
+| `.npz`  | weights and record, as numpy arrays                                      |       |
+
+The networks of all formats take observations (n, n_obs) and return clipped mean actions (n, n_actions).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ce_gym.policies.actor import Actor
+from ce_gym.policies.c_header import to_c
+from ce_gym.policies.environments import environment_of
+from ce_gym.policies.errors import PolicyError
+from ce_gym.policies.files import load_policy, read_actor, write_npz
+from ce_gym.policies.places import locate_policy
+from ce_gym.policies.records import record_of_id
+
+WITHOUT_SOURCES = "ce_gym policy specification, version 1"
+"""Format of specifications in which some observation blocks have no source, and joints the names of links."""
+
+
+def export_policy(path: str | Path, out: Path) -> dict[str, Any]:
+    """Write a policy to `out` in the format of its suffix, and its specification beside it as JSON.
+
+    Only weights and the record are read from the policy; no pickled code is run.
+
+    Args:
+        path: See `ce_gym.load_policy`.
+        out: A file that ends in .onnx, .pt, .h or .npz; the suffix of the specification is `.json`.
+
+    Returns:
+        The specification.
+
+    Raises:
+        PolicyError: If the policy cannot be read, its network or observation has no equivalent in this format, or a
+            file cannot be written.
+    """
+    file = locate_policy(path)
+    if out.suffix not in WRITERS:
+        raise PolicyError(f"{out}: expected a name that ends in one of {', '.join(WRITERS)}")
+    try:
+        if file.suffix == out.suffix == ".onnx":
+            record = load_policy(file).record
+            out.write_bytes(file.read_bytes())
+        else:
+            actor, record = read_actor(file)
+            record = with_sources(record)
+            WRITERS[out.suffix](actor, record, out)
+        out.with_suffix(".json").write_text(json.dumps(record["policy_spec"], indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise PolicyError(f"{out}: cannot be written: {error.strerror}") from None
+    return record["policy_spec"]
+
+
+def with_sources(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record whose specification has the present format; the environment yields it if the record is older."""
+    if record["policy_spec"].get("format") != WITHOUT_SOURCES:
+        return dict(record)
+    return {**record, "policy_spec": record_of_id(environment_of(record), record["env_kwargs"])["policy_spec"]}
+
+
+def _write_onnx(actor: Actor, record: dict[str, Any], out: Path) -> None:
+    from ce_gym.policies.onnx_writer import to_onnx
+
+    out.write_bytes(to_onnx(actor, record).SerializeToString())
+
+
+def _write_torchscript(actor: Actor, record: dict[str, Any], out: Path) -> None:
+    from ce_gym.policies.torchscript import to_torchscript
+
+    out.write_bytes(to_torchscript(actor, record))
+
+
+def _write_c(actor: Actor, record: dict[str, Any], out: Path) -> None:
+    out.write_text(to_c(actor, record), encoding="utf-8")
+
+
+WRITERS: Mapping[str, Callable[[Actor, dict[str, Any], Path], None]] = {
+    ".onnx": _write_onnx,
+    ".pt": _write_torchscript,
+    ".h": _write_c,
+    ".npz": write_npz,
+}
+"""Writers by suffix."""
