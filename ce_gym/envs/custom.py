@@ -62,10 +62,6 @@ def missing(robot: Robot) -> list[RobotError]:
         problems.append(invalid_value(file, "contacts of group 'foot'", None, expected))
     if not robot.independent:
         problems.append(invalid_value(file, "independent", (), "at least one joint"))
-    for joint, gain in robot.gains.kp:  # a robot without gains needs torques as actions
-        if not gain > 0.0:
-            expected = "a position gain above 0 (actions are targets), or none at all"
-            problems.append(invalid_value(file, f"gains.kp.{joint}", gain, expected))
     if not robot.pose.height > 0.0:
         expected = "the height of the standing base above 0 [m]"
         problems.append(invalid_value(file, "pose.height", robot.pose.height, expected))

@@ -21,6 +21,8 @@ FORMAT = "ce_gym policy specification, version 2"
 MEANINGS = {
     "joint_pd": "joint target [rad] = default_pose + scale * clip(action, -1, 1); torque = kp * (target - position) "
     "- kd * velocity, within torque_limits; joints without an action hold the default pose",
+    "joint_velocity": "joint velocity [rad/s] = scale * clip(action, -1, 1); torque = kd * (target - velocity), within "
+    "torque_limits; joints without an action are held at rest",
     "joint_torque": "joint torque [N m] = scale * clip(action, -1, 1); joints without an action have none",
     "motor_pd": "rotor target [rad] = rest + scale * clip(action, -1, 1); the gains of a motor are the gains of its "
     "joints, reflected to the rotor in the default pose with the other motors of its cluster at rest",
@@ -53,13 +55,12 @@ def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
 
     Returns:
         JSON-able data. `joints`, `default_pose` [rad], `kp` [N m/rad], `kd` [N m s/rad] and `torque_limits` [N m] share
-        one order. An observation is the sequence of `observation["blocks"]`. Entry i of a block with a source `of`, one
-        of `coordinates`, is `offset[i] + scale[i] * of[rows[i]]`. The key `meaning` describes all other blocks.
-        `latency` [s] is the range in training of the time from measurement to command.
+        one order; gains that no action uses are 0. An observation is the sequence of `observation["blocks"]`. Entry i
+        of a block with a source `of`, one of `coordinates`, is `offset[i] + scale[i] * of[rows[i]]`. The key `meaning`
+        describes all other blocks. `latency` [s] is the range in training of the time from measurement to command.
     """
     robot, chosen = program.model.robot, program.task
     joints = robot.commanded
-    kp, kd = dict(robot.gains.kp), dict(robot.gains.kd)
     torques = [robot.body(name).joint.torque for name in joints]
     pose = dict(robot.pose.joints)
     return {
@@ -69,8 +70,8 @@ def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
         "task": task,
         "joints": list(robot.joint_names),
         "default_pose": [float(pose.get(name, 0.0)) for name in joints],
-        "kp": [float(kp.get(name, 0.0)) for name in joints],
-        "kd": [float(kd.get(name, 0.0)) for name in joints],
+        "kp": _gains(program, "kp"),
+        "kd": _gains(program, "kd"),
         "torque_limits": [float(torque) if math.isfinite(torque) else None for torque in torques],
         "standing_height": float(robot.pose.height),
         "control_dt": program.control_dt,
@@ -90,18 +91,28 @@ def policy_spec(program: TaskProgram, task: str) -> dict[str, Any]:
     }
 
 
+def _gains(program: TaskProgram, key: str) -> list[float]:
+    """Return the gains "kp" or "kd" of all joints, 0 where control does not use them."""
+    robot, unused = program.model.robot, {"joint_velocity": ["kp"], "joint_torque": ["kp", "kd"]}
+    kinds = dict(zip(program.actions.targets, program.actions.kinds, strict=True))
+    values = {name: gain for name, gain in getattr(robot.gains, key) if key not in unused.get(kinds.get(name, ""), ())}
+    return [float(values.get(name, 0.0)) for name in robot.commanded]
+
+
 def _action(program: TaskProgram) -> dict[str, Any]:
-    actions, kind = program.actions, program.task.actions
-    targets = [actions.targets[i] for i in actions.moved]
-    of_motors = kind.startswith("motor")
+    actions = program.actions
+    targets, kinds = ([values[i] for i in actions.moved] for values in (actions.targets, actions.kinds))
+    different = list(dict.fromkeys(kinds))
+    of_motors = different[0].startswith("motor")
     return {
-        "kind": kind,
-        "meaning": MEANINGS[kind],
+        "kind": different[0] if len(different) == 1 else "mixed",
+        "kinds": kinds,
+        "meaning": "; ".join(MEANINGS[kind] for kind in different),
         "motors" if of_motors else "joints": targets
         if of_motors
         else list(map(program.model.robot.joint_name, targets)),
         "scale": [float(scale) for scale in actions.scale],
-        **({"rest": [float(actions.rest[i]) for i in actions.moved]} if kind == "motor_pd" else {}),
+        **({"rest": [float(actions.rest[i]) for i in actions.moved]} if different[0] == "motor_pd" else {}),
         "low": -1.0,
         "high": 1.0,
     }

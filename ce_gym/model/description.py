@@ -239,7 +239,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Gains:
-    """Joint-space PD gains, pairs (body, value) for every independent joint but passive ones.
+    """Joint-space PD gains, pairs (body, value); independent joints without have a gain of 0.
 
     Attributes:
         kp: Position gains [N m/rad or N/m].

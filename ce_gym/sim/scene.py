@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import get_args
 
-from ce_gym.dynamics.forces.scene import Control, SceneOptions, StepOptions
+from ce_gym.dynamics.forces.scene import Control, JointControl, SceneOptions, StepOptions
 from ce_gym.dynamics.forces.self_collision import apart_when_standing
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.model import Model
@@ -28,6 +28,7 @@ def resolve_scene(
     control: str,
     parameters: Sequence[str] = (),
     material: ContactMaterial | None = None,
+    joint_control: Sequence[tuple[str, JointControl]] = (),
 ) -> StepOptions:
     """Return the options of the sub-steps of one robot.
 
@@ -38,6 +39,7 @@ def resolve_scene(
         control: Meaning of targets, see `ce_gym.Simulator`.
         parameters: Names of parameters that can differ from robot to robot.
         material: Compliance and friction of the contacts; the robot's own if None.
+        joint_control: See `StepOptions`.
 
     Raises:
         ValueError: If the robot lacks a contact or link, or its controllers cannot be sampled.
@@ -54,8 +56,8 @@ def resolve_scene(
         "ground": "field" if terrain is not None and contacts else "flat",
         "hulls": hulls_on(model.robot, contacts, terrain),
     }
-    given = {"control": control, "parameters": tuple(parameters), "material": material or model.robot.material}
-    options = StepOptions(**scene.shared | resolved | given)
+    given = {"control": control, "joint_control": tuple(joint_control), "parameters": tuple(parameters)}
+    options = StepOptions(**scene.shared | resolved | given, material=material or model.robot.material)
     period, samples = scene.control_period, control.endswith("position") and not METHODS[scene.method].controlled
     check("control_period", period, period == 0 or samples, "0, but for control of positions in steps of one length")
     return options

@@ -28,7 +28,7 @@ def edited(tmp_path, **changes):
         ({"tasks": {"velocity": {"dtt": 1}}}, r"robot\.yaml: tasks\.velocity: .*'dtt'"),
         ({"tasks": {"velocity": {"rewards": {"pose": "x"}}}}, r"robot\.yaml: tasks\.velocity: rewards"),
         ({"tasks": {"velocity": {"rewards": 3}}}, r"robot\.yaml: tasks\.velocity: "),
-        ({"gains": None}, r"robot\.yaml: gains\.kp is missing: expected gains"),
+        ({"gains": None}, r"robot\.yaml: gains\.kp\.HR_abad_link_joint is missing: expected a gain above 0"),
     ],
 )
 def test_tasks_in_a_file(tmp_path, changes, message):

@@ -61,13 +61,36 @@ def limit_count(mechanism: Mechanism, options: StepOptions) -> int:
 
 
 def joint_command(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce:
-    """Return the torque commanded at the joints: the target, or a proportional-derivative control's."""
+    """Return the torque commanded at the joints: the target, or a control's of position or velocity.
+
+    Position control has the torque `kp (target - y) - kd yd`, velocity control `kd (target - yd)`, both at the end of
+    the step `dt`.
+    """
     robot = scene.mechanism.robot
     works = SX(ca.DM([float(name not in robot.passive) for name in robot.commanded]))
     if scene.options.control == "torque":
         return JointForce(works * target, SX(target.shape[0], target.shape[0]))
+    if scene.options.joint_control:
+        return _mixed_command(scene, y, yd, target, dt)
     kp, damping = works * scene.values["kp"], works * (scene.values["kd"] + dt * scene.values["kp"])
     return JointForce(kp * (target - y) - damping * yd, ca.diag(dt * damping))
+
+
+def _mixed_command(scene: Scene, y: SX, yd: SX, target: SX, dt: float) -> JointForce:
+    """Return the torque commanded at the joints where the kind of control differs from joint to joint."""
+    robot, kinds, n = scene.mechanism.robot, dict(scene.options.joint_control), target.numel()
+    tau, slope = SX.zeros(n), SX(n, n)
+    for i, name in enumerate(robot.commanded):
+        kind, kp, kd = kinds.get(name, "position"), scene.values["kp"][i], scene.values["kd"][i]
+        if name in robot.passive:
+            continue
+        if kind == "torque":
+            tau[i] = target[i]
+        elif kind == "velocity":
+            tau[i], slope[i, i] = kd * (target[i] - yd[i]), dt * kd
+        else:
+            tau[i], slope[i, i] = kp * (target[i] - y[i]) - (kd + dt * kp) * yd[i], dt * (kd + dt * kp)
+    return JointForce(tau, slope)
 
 
 def encoder_map(mechanism: Mechanism, kinematics: Kinematics) -> SX:

@@ -22,6 +22,7 @@ from ce_gym.model.mechanism import Mechanism
 from ce_gym.model.options import Options, names, number, one_of, option, optional, pairs_of_names, positive, whole
 
 Control = Literal["position", "torque", "motor_position", "motor_torque"]
+JointControl = Literal["velocity", "torque"]
 Ground = Literal["flat", "field"]
 
 
@@ -87,6 +88,7 @@ class StepOptions(SceneOptions):
         seldom: Names of contact spheres, see `stepping/broad_phase.py`.
         self_collisions: Pairs of names of links.
         control: Meaning of targets, see `ce_gym.Simulator`.
+        joint_control: Joints whose targets are velocities or torques although `control` is "position", by name.
         material: Compliance and friction of the contacts.
         parameters: Names of parameters that are inputs rather than constants, see `PARAMETERS`.
         ground: "flat" for the plane z = 0, "field" for a height and slope under each contact that the caller supplies.
@@ -99,6 +101,7 @@ class StepOptions(SceneOptions):
     seldom: tuple[str, ...] = ()
     self_collisions: tuple[tuple[str, str], ...] = ()
     control: Control = "position"
+    joint_control: tuple[tuple[str, JointControl], ...] = ()
     material: ContactMaterial = field(default_factory=ContactMaterial)
     parameters: tuple[str, ...] = ()
     ground: Ground = "flat"

@@ -104,7 +104,10 @@ class MotorDrives(ForceLaw):
         scene, total, options = start.scene, SX(0), self.options
         if options.control == "position":
             at = encoder_map(scene.mechanism, start.kinematics) @ start.y
-            total += ca.sum1(scene.values["motor_strength"] * scene.values["kp"] * (start.target - at) ** 2) / 2
+            others = dict(options.joint_control)
+            held = [i for i, name in enumerate(scene.mechanism.robot.commanded) if name not in others]
+            springs = scene.values["kp"][held] * (start.target - at)[held] ** 2
+            total += ca.sum1(scene.values["motor_strength"] * springs) / 2
         if options.control == "motor_position":
             stiffness, stretch = motor_springs(scene, start.kinematics, start.y, start.target)
             total += ca.sum1(scene.values["motor_strength"] * stiffness * stretch**2) / 2

@@ -20,7 +20,7 @@ from ce_gym.envs.task.skills import SKILLS
 from ce_gym.envs.task.tasks import TASKS, Task, deployable
 from ce_gym.model.arguments import check, check_choice, check_whole
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import RobotError, invalid_value, listed_names, unknown_name
+from ce_gym.model.errors import RobotError, listed_names, unknown_name
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.model.options import check_fields
 from ce_gym.sim.devices import Device, device_named
@@ -101,9 +101,6 @@ def make_program(
     figures = replace(figures, rewards=merged_rewards(figures.rewards, {} if rewards is None else rewards))
     figures = changed_task(figures, changes)
     check("observations", figures.observations, figures.observations, "at least one name")
-    if figures.actions.endswith("_pd") and not model.robot.gains.kp:
-        file, expected = model.robot.source or model.robot.name, f"gains, because actions={figures.actions!r} need them"
-        raise invalid_value(file, "gains.kp", None, expected)
     program = TaskProgram(model, figures, contact_forces)
     program.stages  # noqa: B018  (traces the terms, which finds wrong ones)
     return program

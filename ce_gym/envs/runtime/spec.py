@@ -54,7 +54,8 @@ class TaskSpec:
         self.field = field_of(task.terrain)
         self.randomised = Randomised(robot, task.randomise)
         self.actions = ActionMap(model.mechanism, task)
-        self.options = resolve_scene(task, model, self.field, self.actions.control, self.randomised.parameters)
+        given = {"parameters": self.randomised.parameters, "joint_control": self.actions.joint_control}
+        self.options = resolve_scene(task, model, self.field, self.actions.control, **given)
         self.contacts = self.options.contacts
         on_field = self.curriculum.on_field
         self.ground = Ground(model.mechanism, self.contacts, self.options.hulls) if on_field else None

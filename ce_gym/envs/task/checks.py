@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from ce_gym.envs.terms.registry import terms_of
-from ce_gym.model.arguments import check, is_number
+from ce_gym.model.arguments import check, check_choice, is_number
 from ce_gym.model.errors import check_names, listed_names
 from ce_gym.model.options import Check
 
@@ -31,6 +31,21 @@ def list_of_names(name: str, value: Any) -> tuple[str, ...]:
     items = tuple(_sequence(name, value))
     check(name, value, all(isinstance(item, str) for item in items), "a list of names")
     return items
+
+
+def action_kinds(known: Collection[str]) -> Check:
+    """Return a check for a meaning of actions, or for meanings of actions on joints by pattern of joints."""
+
+    def checked(name: str, value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            check_choice(name, value, known)
+            return value
+        check(name, value, value, "at least one pattern of joints")
+        for pattern, kind in value.items():
+            check_choice(f"{name}[{pattern!r}]", kind, [kind for kind in known if kind.startswith("joint")])
+        return {str(pattern): kind for pattern, kind in value.items()}
+
+    return checked
 
 
 def command_ranges(name: str, value: Any) -> tuple[tuple[float, float], ...]:

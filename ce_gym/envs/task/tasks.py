@@ -13,14 +13,14 @@ from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 from ce_gym.dynamics.forces.scene import SceneOptions
-from ce_gym.envs.task.checks import command_ranges, list_of_names, magnitudes, ranges, terms, whole_range
+from ce_gym.envs.task.checks import action_kinds, command_ranges, list_of_names, magnitudes, ranges, terms, whole_range
 from ce_gym.envs.task.terrain_tiles import checked_terrain
-from ce_gym.model.options import flag, names, number, one_of, option, positive, whole
+from ce_gym.model.options import flag, names, number, option, positive, whole
 
 Range = tuple[float, float]
 Terms = tuple[str, ...] | Mapping[str, Mapping[str, Any]]
 """Names of terms, or their parameters by name."""
-Actions = Literal["joint_pd", "joint_torque", "motor_pd", "motor_torque"]
+Actions = Literal["joint_pd", "joint_velocity", "joint_torque", "motor_pd", "motor_torque"]
 
 RESET_NOISE = {"joint_position": 0.1, "joint_velocity": 0.2, "base_velocity": 0.2}
 """Largest deviations from the standing pose at the start, see `Task.reset_noise`."""
@@ -47,7 +47,9 @@ class Task(SceneOptions):
         critic: Observation blocks that only the critic sees, without noise, if `obs_mode` is "dict".
         noise: Largest error of each observation block, uniform, by name, in the unit of the block.
         history: Number of observations that the policy sees, the newest first.
-        actions: Meaning of an action. "joint_pd": joint targets, `standing pose + action_scale * action` [rad].
+        actions: Meaning of an action, or meanings by pattern of joints such as `{"*": "joint_pd", "*wheel":
+            "joint_velocity"}`, of which the last pattern that fits a joint counts. "joint_pd": joint targets, `standing
+            pose + action_scale * action` [rad]. "joint_velocity": shares of the largest joint velocities, held by `kd`.
             "motor_pd": targets of rotors, `angle in the standing pose + action_scale * N * action` [rad], where N is
             the gear ratio to the joint that the motor drives most. "joint_torque" and "motor_torque": shares of the
             largest torques of joints and motors.
@@ -81,7 +83,7 @@ class Task(SceneOptions):
     critic: Terms = option(terms, ())
     noise: Mapping[str, float] = option(magnitudes(), {}, merges=True)
     history: int = option(whole(1), 1)
-    actions: Actions = option(one_of(get_args(Actions)), "joint_pd")
+    actions: Actions | Mapping[str, Actions] = option(action_kinds(get_args(Actions)), "joint_pd")
     action_scale: float = option(positive(), 0.5)
     action_joints: tuple[str, ...] = option(list_of_names, ("*",))
     latency: tuple[int, int] = option(whole_range, (0, 0))

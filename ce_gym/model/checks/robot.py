@@ -236,9 +236,6 @@ def _check_pose_and_gains(robot: Robot, file: str) -> None:
                 raise invalid_value(file, f"{key}.{joint}", gain, "0 or more")
             if joint in robot.passive:
                 raise invalid_value(file, f"{key}.{joint}", gain, "no gain for a passive joint (torque limit 0)")
-        for joint in robot.driven:
-            if pairs and joint not in dict(pairs):
-                raise invalid_value(file, f"{key}.{joint}", None, "a gain for every independent joint or for none")
 
 
 def _check_within_limits(robot: Robot, file: str) -> None:
