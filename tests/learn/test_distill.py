@@ -152,7 +152,7 @@ def test_interrupted_and_resumed_is_as_if_it_never_stopped(tmp_path, monkeypatch
     assert part.record["steps"] == 2 * 512
     rest = train(job(tmp_path / "rest", resume=part.policy, threads=2))
     np.testing.assert_array_equal(parameters(whole.policy), parameters(rest.policy))
-    with pytest.raises(PolicyError, match=r"has layers \[\d+, 64, 64, 12\], Tanh; expected \[\d+, 8, 12\]"):
+    with pytest.raises(PolicyError, match=r"has layers \[\d+, 128, 64, 12\], Tanh; expected \[\d+, 8, 12\]"):
         train(job(tmp_path / "other", settings=["hidden=[8]"], resume=part.policy))
 
 
