@@ -42,15 +42,15 @@ def to_c(actor: Actor, record: dict[str, Any]) -> str:
     """Return the text of a header with constants `POLICY_*`, arrays `policy_*` and the function `policy_act`.
 
     Raises:
-        PolicyError: If an observation block has no source, or actions are not commands to joints.
+        PolicyError: If an observation block has no source, or actions are not joint targets.
     """
     spec = record["policy_spec"]
     blocks, action = spec["observation"]["blocks"], spec["action"]
     for block in blocks:
         if block.get("of") not in SOURCES:
             raise PolicyError(f"observation block {block['name']}: has no formula; expected a policy without, for C")
-    if "joints" not in action:
-        raise PolicyError(f"actions={action['kind']!r}; expected actions on joints, for C")
+    if action["kind"] != "joint_pd":
+        raise PolicyError(f"actions={action['kind']!r}; expected 'joint_pd', for C")
     low, high = np.transpose(spec["command"]["range"])
     commanded = [spec["joints"].index(name) for name in action["joints"]]
     lines = [

@@ -54,7 +54,7 @@ def export_policy(path: str | Path, out: Path) -> dict[str, Any]:
             out.write_bytes(file.read_bytes())
         else:
             actor, record = read_actor(file)
-            record = with_sources(record)
+            record = complete_record(record)
             WRITERS[out.suffix](actor, record, out)
         out.with_suffix(".json").write_text(json.dumps(record["policy_spec"], indent=2) + "\n", encoding="utf-8")
     except OSError as error:
@@ -62,11 +62,18 @@ def export_policy(path: str | Path, out: Path) -> dict[str, Any]:
     return record["policy_spec"]
 
 
-def with_sources(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a record whose specification has the present format; the environment yields it if the record is older."""
-    if record["policy_spec"].get("format") != WITHOUT_SOURCES:
-        return dict(record)
-    return {**record, "policy_spec": record_of_id(environment_of(record), record["env_kwargs"])["policy_spec"]}
+def complete_record(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a record with a specification of the present format, and with the latency of training in it.
+
+    The environment yields the specification if the record is older.
+    """
+    spec = record["policy_spec"]
+    if spec.get("format") == WITHOUT_SOURCES:
+        spec = record_of_id(environment_of(record), record["env_kwargs"])["policy_spec"]
+    trained = record.get("settings", {}).get("training", {})
+    if "latency" in trained:
+        spec = {**spec, "latency": [steps * spec["physics_dt"] for steps in trained["latency"]]}
+    return {**record, "policy_spec": spec}
 
 
 def _write_onnx(actor: Actor, record: dict[str, Any], out: Path) -> None:

@@ -171,6 +171,24 @@ def test_every_format_acts_as_the_policy(activation, normalised, tmp_path):
         np.testing.assert_allclose(act(obs), expected, rtol=0, atol=1e-5)
 
 
+def test_the_latency_of_training_is_exported(tmp_path):
+    policy = saved(tmp_path / "walk.npz", ROBOT_ENV)
+    actor, record = read_actor(policy)
+    write_npz(actor, {**record, "settings": {"training": {"latency": [0, 4]}}}, policy)
+    assert command("export", policy, "--out", tmp_path / "out.onnx") == 0
+    assert json.loads((tmp_path / "out.json").read_text())["latency"] == pytest.approx([0, 0.02])
+
+
+def test_what_c_lacks_is_said(tmp_path, capsys):
+    for options, words in (
+        ({"actions": "joint_torque"}, "actions='joint_torque'; expected 'joint_pd', for C"),
+        ({"observations": ["torques"]}, "observation block torques: has no formula"),
+    ):
+        policy = saved(tmp_path / "walk.npz", ROBOT_ENV, **options)
+        assert command("export", policy, "--out", tmp_path / "out.h") == 2
+        assert words in capsys.readouterr().err
+
+
 def test_an_older_policy_gets_sources_and_names_of_joints(tmp_path):
     policy = saved(tmp_path / "walk.npz", ROBOT_ENV)
     actor, record = read_actor(policy)
