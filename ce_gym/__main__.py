@@ -69,7 +69,8 @@ def run(work: Callable[[], int]) -> int:
     """Do the work of a command and return its exit code: 2 after an error that the user can fix, 130 after Ctrl-C."""
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _show_warning
+            shown: set[str] = set()
+            warnings.showwarning = lambda message, *_, **__: _show_once(str(message), shown)
             return work()
     except KeyboardInterrupt:
         print("ce_gym: interrupted", file=sys.stderr)
@@ -91,8 +92,11 @@ def _run(argv: list[str]) -> int:
     return args.run(args)
 
 
-def _show_warning(message: Warning | str, *_: object) -> None:
-    print(f"ce_gym: warning: {message}", file=sys.stderr)
+def _show_once(message: str, shown: set[str]) -> None:
+    """Print a warning that has not been shown yet."""
+    if message not in shown:
+        shown.add(message)
+        print(f"ce_gym: warning: {message}", file=sys.stderr)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -169,13 +173,13 @@ def _list(args: argparse.Namespace) -> int:
 
 def _new(args: argparse.Namespace) -> int:
     from ce_gym.envs.custom import id_stem, missing, zero_limits
-    from ce_gym.export.new_robot import write_new_robot
+    from ce_gym.new_robot.robot_file import write_new_robot
 
-    path, robot = write_new_robot(args.file, args.out)
+    path, robot, guessed = write_new_robot(args.file, args.out)
     guesses = path.read_text(encoding="utf-8").count("GUESS") - 1
     print(f"{path}: {len(robot.independent)} joints, {len(robot.contacts)} contact spheres, {guesses} lines of guesses")
-    for problem in missing(robot):
-        print(f"  missing: {problem}")
+    for problem in (*missing(robot), *guessed.warnings):
+        print(f"  check: {problem}")
     for line in zero_limits(robot):
         print(f"  {line}")
     print(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ce_gym.dynamics.constraints.closure import Closure, closures
 from ce_gym.dynamics.constraints.cluster_constraints import linear_solution
 from ce_gym.model.clusters import Cluster
+from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, invalid_value
 from ce_gym.model.frames import rotation_matrix
 from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody, skew
@@ -22,7 +23,7 @@ Array = NDArray[np.float64]
 
 SMALLEST_EIGENVALUE = 1e-12
 """Smallest allowed eigenvalue of the mass matrix scaled to ones on its diagonal; below, accelerations are noise [-]."""
-DEEPEST_CONTACT = 0.1
+DEEPEST_CONTACT = 0.01
 """Largest allowed depth of contacts below ground in the standing pose [m]."""
 FURTHEST_BEYOND = 0.01
 """Tolerance of limits of dependent joints, because loops are assembled from rounded numbers [rad or m]."""
@@ -63,12 +64,17 @@ def check_standing(mechanism: Mechanism) -> None:
             raise invalid_value(file, f"joint {body.name!r} in the standing pose", angle, expected)
     _check_mass_matrix(mechanism, mass_matrix(mechanism, standing), file)
     placed = mechanism.robot.floating and mechanism.robot.pose.height != 0.0  # 0 is the default height
-    for contact in mechanism.robot.contacts if placed else ():
-        centre = standing.p[contact.body] + standing.R[contact.body] @ np.array(contact.position)
-        lean = float(np.hypot(*(standing.R[contact.body] @ np.array(contact.axis))[:2]))
-        if centre[2] - contact.radius - contact.rim * lean < -DEEPEST_CONTACT:
-            expected = f"a height that keeps contact {contact.name!r}, now {centre[2]:.3g} m high, above ground"
-            raise invalid_value(file, "pose.height", mechanism.robot.pose.height, expected)
+    heights = contact_heights(mechanism.robot, standing)
+    lowest = min(heights, key=heights.__getitem__, default="")
+    if placed and heights and heights[lowest] < -DEEPEST_CONTACT:
+        height = mechanism.robot.pose.height
+        expected = f"{height - heights[lowest]:.4f}, at which contact {lowest!r} touches the ground"
+        raise invalid_value(file, "pose.height", height, expected)
+
+
+def contact_heights(robot: Robot, standing: Standing) -> dict[str, float]:
+    """Return the height of the lowest point of each contact above flat ground in the standing pose [m], by name."""
+    return {c.name: c.lowest_point(standing.p[c.body], standing.R[c.body]) for c in robot.contacts}
 
 
 def _check_mass_matrix(mechanism: Mechanism, M: Array, file: str) -> None:

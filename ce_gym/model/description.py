@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ce_gym.model.constraints import Constraint, LinearConstraint
 from ce_gym.model.coordinates import Layout, placed, sizes, unit_quaternions
@@ -182,6 +183,16 @@ class ContactSphere:
     rim: NotNegative = 0.0
     axis: Vec3 = (0.0, 0.0, 1.0)
     shape: str = ""
+
+    def lowest_point(self, position: NDArray[np.float64], rotation: NDArray[np.float64]) -> float:
+        """Return the height of the lowest point [m].
+
+        Args:
+            position: Origin of the body in the world [m], shape (3,).
+            rotation: Rotation, body to world, shape (3, 3).
+        """
+        lean = float(np.hypot(*(rotation @ np.array(self.axis))[:2]))  # the rim is vertical at 1, horizontal at 0
+        return float((position + rotation @ np.array(self.position))[2]) - self.radius - self.rim * lean
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ MAY_IMPORT = {
     "adapters": {"model", "envs", "policies"},
     "policies": {"model"},
     "viewer": {"model", "dynamics", "sim", "envs", "policies"},
+    "new_robot": {"model", "dynamics", "viewer"},
     "identify": {"model", "dynamics", "compile", "sim", "viewer"},
     "learn": {"model", "dynamics", "compile", "export", "envs", "adapters", "policies", "viewer"},
     "bench": {

@@ -46,6 +46,6 @@ motors:
   hip_rotor: {torque: 3}
 contacts:
   toe: {body: foot, position: [0, 0, 0], radius: 0.02}
-pose: {height: 0.5, joints: {thigh: 0.1}}
+pose: {height: 0.52, joints: {thigh: 0.1}}
 gains: {kp: 20, kd: {thigh: 1, shank: 2}}
 """

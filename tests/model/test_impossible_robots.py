@@ -82,8 +82,16 @@ def test_joints_that_a_pose_does_not_name_are_within_limits(write_robot, tmp_pat
 
 
 def test_a_standing_pose_below_ground(write_robot):
-    with pytest.raises(RobotError, match=r"leg\.yaml: pose\.height is 0\.3: .*'toe', now -0\.\d+ m high"):
-        Model(load_robot(write_robot(("height: 0.5", "height: 0.3"))))
+    """The hip bends by 0.1 rad, so the ball of the toe is 0.5 cos 0.1 below the base, and 0.02 m further down."""
+    right = 0.5 * np.cos(0.1) + 0.02
+    with pytest.raises(RobotError, match=rf"leg\.yaml: pose\.height is 0\.3: expected {right:.4f}, .* contact 'toe'"):
+        Model(load_robot(write_robot(("height: 0.52", "height: 0.3"))))
+    Model(load_robot(write_robot(("height: 0.52", f"height: {right - 0.009}"))))
+    for height in ("height: auto, ", ""):
+        auto = load_robot(write_robot(("height: 0.52, ", height)))
+        assert auto.pose.height == pytest.approx(right, abs=1e-12)
+    with pytest.raises(RobotError, match=r"pose\.height is 'lots': expected a number .* or auto"):
+        load_robot(write_robot(("height: 0.52", "height: lots")))
 
 
 @pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")

@@ -118,9 +118,24 @@ def test_further_ties_and_chosen_independent_joints(write_robot):
     path = write_robot(
         ("base: floating\n", f"base: floating\n{tie}independent: [shank]\n"),
         ("kd: {thigh: 1, shank: 2}", "kd: 1"),
-        ("{height: 0.5, joints: {thigh: 0.1}}", "{height: 0.5}"),
+        ("{height: 0.52, joints: {thigh: 0.1}}", "{height: 0.52}"),
     )
     assert load_robot(path).independent == ("shank",)
+
+
+def test_limits_in_a_yaml_file_go_before_those_of_the_urdf(write_robot):
+    limits = "limits: {torque: 7, velocity: {knee: 5}, position: {hip: [-0.5, 0.5]}}\n"
+    robot = load_robot(write_robot(("base: floating\n", f"base: floating\n{limits}")))
+    hip, knee = robot.body("thigh").joint, robot.body("shank").joint
+    assert (hip.torque, hip.velocity, hip.position) == (7.0, 20.0, (-0.5, 0.5))
+    assert (knee.torque, knee.velocity, knee.position) == (7.0, 5.0, (-np.inf, np.inf))
+    for wrong, message in (
+        ("position: {hip: [1, 0]}", r"limits\.position\.hip is \[1\.0, 0\.0\]: expected the lower limit first"),
+        ("torque: {toe: 1}", "limits is 'toe'"),
+        ("speed: 1", "limits is 'speed'"),
+    ):
+        with pytest.raises(RobotError, match=message):
+            load_robot(write_robot(("base: floating\n", f"base: floating\nlimits: {{{wrong}}}\n")))
 
 
 def test_welded_links_merge_by_the_parallel_axis_theorem(load_urdf):

@@ -12,8 +12,8 @@ from mjcf_files import GEOMS
 from ce_gym.__main__ import main
 from ce_gym.dynamics import Model
 from ce_gym.envs.custom import missing
-from ce_gym.export.new_robot import write_new_robot
 from ce_gym.model import RobotError, load_robot
+from ce_gym.new_robot.robot_file import write_new_robot
 
 PUP = Path(__file__).parents[1] / "data" / "own_robot" / "pup.urdf"
 
@@ -24,27 +24,25 @@ def pup(tmp_path):
 
 
 def test_a_urdf_becomes_a_robot_that_tasks_can_use(pup):
-    path, robot = write_new_robot(pup)
+    path, robot, _ = write_new_robot(pup)
     assert path == pup.with_suffix(".yaml")
     assert not missing(robot)
     feet = {c.body: (c.position, c.radius) for c in robot.contacts if c.group == "foot"}
     assert feet == {f"{leg}_shank": ((0.0, 0.0, -0.16), 0.02) for leg in ("fl", "fr", "hl", "hr")}
     assert len([c for c in robot.contacts if c.group == "torso"]) == 8
     angles = dict(robot.pose.joints)
-    assert {angles[f"{leg}_thigh"] for leg in ("fl", "fr", "hl", "hr")} == {0.5}
-    assert {angles[f"{leg}_shank"] for leg in ("fl", "fr", "hl", "hr")} == {-1.0}, "knees bend the way they can"
+    assert {angles[f"{leg}_shank"] for leg in ("fl", "fr", "hl", "hr")} == {-2 * angles["fl_thigh"]}, "as limits allow"
+    assert np.cos(angles["fl_thigh"]) == pytest.approx(0.87, abs=0.03), "thigh and shank are equally long"
     model = Model(robot)
     points = model.contact_points(model.standing_q, np.zeros(model.nv))[0]
     lowest = min(z - c.radius for c, z in zip(robot.contacts, points[:, 2], strict=True))
     assert lowest == pytest.approx(0.0, abs=1e-6)
-    torque = robot.body("fl_thigh").joint.torque
-    assert dict(robot.gains.kp)["fl_thigh"] == pytest.approx(torque / 0.6, rel=0.05)
-    assert dict(robot.gains.kd)["fl_thigh"] == pytest.approx(torque / 0.6 * 0.025, rel=0.1)
+    assert robot.body("fl_thigh").joint.torque == 16.0
 
 
 def test_rotors_are_there_to_be_filled_in(pup):
     """The template's lines, without their #, are a robot with a rotor at every joint."""
-    path, robot = write_new_robot(pup)
+    path, robot, _ = write_new_robot(pup)
     assert not list(robot.rotors())
     text = path.read_text()
     lines = [line for line in text.splitlines() if line == "# rotors:" or line.startswith("#   ")]
@@ -52,7 +50,7 @@ def test_rotors_are_there_to_be_filled_in(pup):
     for line in lines:
         text = text.replace(line, line.removeprefix("# "), 1)
     path.write_text(text)
-    assert [rotor.name for rotor in load_robot(path).rotors()] == [f"{joint}_rotor" for joint in robot.independent]
+    assert [rotor.name for rotor in load_robot(path).rotors()] == [f"{joint}_rotor" for joint in robot.joint_names]
 
 
 @pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
@@ -62,9 +60,8 @@ def test_an_mjcf_file_keeps_what_it_says(tmp_path):
     key = '<keyframe><key qpos="0 0 0.6 1 0 0 0 0.25"/></keyframe>'
     start = '<mujoco model="m"><compiler angle="radian" autolimits="true"/>'
     (tmp_path / "hopper.xml").write_text(f"{start}{GEOMS}{actuator}{key}</mujoco>")
-    _, robot = write_new_robot(tmp_path / "hopper.xml", tmp_path / "other.yaml")
+    _, robot, _ = write_new_robot(tmp_path / "hopper.xml", tmp_path / "other.yaml")
     assert robot.contacts == load_robot(tmp_path / "hopper.xml").contacts
-    assert (robot.gains.kp, robot.gains.kd) == ((("leg", 10.0),), (("leg", 0.25),))
     assert robot.pose.joints == (("leg", 0.25),)
     assert robot.pose.height == pytest.approx(0.4 * np.cos(0.25) + 0.02, abs=1e-5), "feet just touch"
 

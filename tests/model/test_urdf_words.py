@@ -10,8 +10,8 @@ import pytest
 import ce_gym
 from ce_gym.__main__ import main
 from ce_gym.envs.custom import zero_limits
-from ce_gym.export.new_robot import write_new_robot
 from ce_gym.model import LossyImportWarning, RobotError, load_robot
+from ce_gym.new_robot.robot_file import write_new_robot
 
 PUP = Path(__file__).parents[1] / "data" / "own_robot" / "pup.urdf"
 I = 0.02
@@ -259,7 +259,7 @@ def test_a_new_file_gives_no_gains_to_joints_without_effort(tmp_path: Path):
     urdf = tmp_path / "pup.urdf"
     urdf.write_text(f'{head}effort="0{tail[tail.index(chr(34)) :]}')
     (tmp_path / "pup.yaml").write_text("name: another\nurdf: pup.urdf\n")
-    out, robot = write_new_robot(urdf, tmp_path / "mine.yaml")
+    out, robot, _ = write_new_robot(urdf, tmp_path / "mine.yaml")
     assert len(robot.passive) == 1
     assert robot.name == "pup"
     assert {"fl thigh: 1", "on"} <= {*robot.independent}
@@ -283,7 +283,7 @@ def test_a_new_file_names_the_urdf_from_its_own_folder(tmp_path: Path):
     (tmp_path / "mine").mkdir()
     urdf = tmp_path / "vendor parts" / "pup.urdf"
     urdf.write_text(PUP.read_text())
-    out, robot = write_new_robot(urdf, tmp_path / "mine" / "pup.yaml")
+    out, robot, _ = write_new_robot(urdf, tmp_path / "mine" / "pup.yaml")
     assert '"../vendor parts/pup.urdf"' in out.read_text()
     assert load_robot(out).independent == robot.independent
 
@@ -291,7 +291,7 @@ def test_a_new_file_names_the_urdf_from_its_own_folder(tmp_path: Path):
 def test_a_new_file_that_cannot_be_loaded_is_not_left_behind(tmp_path: Path, monkeypatch):
     urdf = tmp_path / "pup.urdf"
     urdf.write_text(PUP.read_text())
-    monkeypatch.setattr("ce_gym.export.new_robot._contacts", lambda *_: "contacts: 3")
+    monkeypatch.setattr("ce_gym.new_robot.robot_file._contacts", lambda *_: "contacts: 3")
     with pytest.raises(RobotError):
         write_new_robot(urdf)
     assert not urdf.with_suffix(".yaml").exists()

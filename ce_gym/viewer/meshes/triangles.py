@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -53,7 +54,7 @@ def drawn_meshes(robot: Robot, most: int = MOST) -> dict[str, tuple[Shape | Tria
     Warns:
         UserWarning: A mesh cannot be read, or a package for meshes is not installed.
     """
-    full = {name: _full_meshes(visuals) for name, visuals in visuals_of(robot).items()}
+    full = {name: read_meshes(visuals) for name, visuals in visuals_of(robot).items()}
     count = sum(len(item.faces) for items in full.values() for item in items if isinstance(item, Triangles))
     share = min(1.0, most / max(count, 1))
     return {
@@ -63,8 +64,12 @@ def drawn_meshes(robot: Robot, most: int = MOST) -> dict[str, tuple[Shape | Tria
     }
 
 
-def _full_meshes(visuals: tuple[Visual, ...]) -> list[Shape | Triangles]:
-    """Return primitives and readable meshes."""
+def read_meshes(visuals: Iterable[Visual]) -> list[Shape | Triangles]:
+    """Return primitives and readable meshes.
+
+    Warns:
+        UserWarning: A mesh cannot be read, or a package for meshes is not installed.
+    """
     items: list[Shape | Triangles] = []
     for visual in visuals:
         if isinstance(visual, Shape):

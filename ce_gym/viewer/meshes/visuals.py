@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import unquote
 
 import numpy as np
@@ -21,6 +21,7 @@ from ce_gym.model.formats.mjcf.balls import balls_in_loops
 from ce_gym.model.formats.mjcf.bodies import read_bodies
 from ce_gym.model.formats.mjcf.equalities import locked_joints
 from ce_gym.model.formats.mjcf.source import MjcfSource, placement, read_mjcf
+from ce_gym.model.formats.mjcf.touching import solid
 from ce_gym.model.formats.placement import compose
 from ce_gym.model.formats.reading import read_yaml
 from ce_gym.model.formats.text_file import one_line
@@ -56,6 +57,22 @@ class MeshFile:
 
 
 Visual = MeshFile | Shape
+Tag = Literal["visual", "collision"]
+
+
+@dataclass(frozen=True)
+class LinkShape:
+    """A mesh or primitive of a link.
+
+    Attributes:
+        link: Name of the link, also of a link on a fixed joint.
+        body: Name of the body that carries the link.
+        item: The mesh or primitive, in the frame of the body.
+    """
+
+    link: str
+    body: str
+    item: Visual
 
 
 def visuals_of(robot: Robot) -> dict[str, tuple[Visual, ...]]:
@@ -64,12 +81,19 @@ def visuals_of(robot: Robot) -> dict[str, tuple[Visual, ...]]:
     if not robot.source or not source.is_file():
         return {}
     names = frozenset(body.name for body in robot.bodies)
-    visuals = _read(source, source.stat().st_mtime_ns, robot.floating, names)
-    return {name: items for name, items in visuals.items() if name in names}
+    shapes = _read(source, source.stat().st_mtime_ns, robot.floating, names, "visual")
+    visuals = {name: tuple(shape.item for shape in shapes if shape.body == name) for name in names}
+    return {name: items for name, items in visuals.items() if any(isinstance(item, MeshFile) for item in items)}
+
+
+def link_shapes(robot: Robot, tag: Tag) -> tuple[LinkShape, ...]:
+    """Return the meshes and primitives of all links that are drawn ("visual") or that touch ("collision")."""
+    source = Path(robot.source)
+    return _read(source, source.stat().st_mtime_ns, robot.floating, frozenset(body.name for body in robot.bodies), tag)
 
 
 @lru_cache(maxsize=32)
-def _read(source: Path, modified: int, floating: bool, names: frozenset[str]) -> dict[str, tuple[Visual, ...]]:
+def _read(source: Path, modified: int, floating: bool, names: frozenset[str], tag: Tag) -> tuple[LinkShape, ...]:
     """Read a file in its version of the time `modified`.
 
     Warns:
@@ -79,22 +103,22 @@ def _read(source: Path, modified: int, floating: bool, names: frozenset[str]) ->
         if source.suffix.lower() in (".yaml", ".yml"):
             data = read_yaml(source).data
             source = source.parent / str(data.get("urdf") or data.get("mjcf"))
-        visuals = list(_read_mjcf(source) if source.suffix.lower() == ".xml" else _read_urdf(source, floating, names))
+        if source.suffix.lower() == ".xml":
+            return tuple(_read_mjcf(source, tag))
+        return tuple(_read_urdf(source, floating, names, tag))
     except (RobotError, OSError) as error:  # the file may have changed since the robot was read
         warnings.warn(f"{source}: meshes are not drawn: {one_line(error)}", stacklevel=2)
-        return {}
-    bodies = {body: tuple(visual for name, visual in visuals if name == body) for body, _ in visuals}
-    return {body: items for body, items in bodies.items() if any(isinstance(item, MeshFile) for item in items)}
+        return ()
 
 
-def _read_urdf(path: Path, floating: bool, names: Collection[str]) -> Iterator[tuple[str, Visual]]:
+def _read_urdf(path: Path, floating: bool, names: Collection[str], tag: Tag) -> Iterator[LinkShape]:
     graph = UrdfGraph(path)
     frames = read_tree(graph, "floating" if floating else "fixed", tied=names).frames
     colors = read.colors_of(graph.file, graph.robot)
     missing: list[str] = []
     for link, element in graph.links.items():
         body, frame = frames[link]
-        for visual in element.findall("visual") if body else ():
+        for visual in element.findall(tag) if body else ():
             try:
                 item = _visual(graph.file, f"link {link!r}", visual, colors)
             except FileNotFoundError as error:
@@ -103,7 +127,7 @@ def _read_urdf(path: Path, floating: bool, names: Collection[str]) -> Iterator[t
                 warnings.warn(f"{error}: its mesh is not drawn", stacklevel=2)
             else:
                 if item is not None and body is not None:
-                    yield body, replace(item, placement=compose(frame, item.placement))
+                    yield LinkShape(link, body, replace(item, placement=compose(frame, item.placement)))
     if missing:
         problem = f"{len(missing)} meshes are missing or of another kind, such as {missing[0]!r}"
         warnings.warn(f"{path}: {problem}; expected {', '.join(KINDS)} files: shapes are drawn", stacklevel=2)
@@ -169,7 +193,7 @@ def _candidates(name: str, folder: Path) -> list[Path]:
     return [path / inside for path in above if path.name == package] + [path / package / inside for path in above]
 
 
-def _read_mjcf(path: Path) -> Iterator[tuple[str, Visual]]:
+def _read_mjcf(path: Path, tag: Tag) -> Iterator[LinkShape]:
     source = read_mjcf(path)
     model, kinds = source.model, source.mujoco.mjtGeom
     frames = read_bodies(source, locked_joints(source), balls_in_loops(source)).frames
@@ -177,16 +201,17 @@ def _read_mjcf(path: Path) -> Iterator[tuple[str, Visual]]:
     types |= {kinds.mjGEOM_CAPSULE: "capsule", kinds.mjGEOM_CYLINDER: "cylinder"}
     for geom in range(model.ngeom):
         body, frame = frames[model.geom_bodyid[geom]]
-        kind = kinds(int(model.geom_type[geom]))
-        if body is None or model.geom_group[geom] >= SEEN_GROUPS:
+        link, kind = source.name("body", model.geom_bodyid[geom]), kinds(int(model.geom_type[geom]))
+        seen = model.geom_group[geom] < SEEN_GROUPS if tag == "visual" else solid(source, geom)
+        if body is None or not seen:
             continue
         pose, color = compose(frame, placement(model.geom_pos[geom], model.geom_quat[geom])), _geom_color(source, geom)
         if kind == kinds.mjGEOM_MESH:
-            yield body, MeshFile(path, int(model.geom_dataid[geom]), placement=pose, color=color)
+            yield LinkShape(link, body, MeshFile(path, int(model.geom_dataid[geom]), placement=pose, color=color))
         elif kind in types:
             a, b, c = (float(x) for x in model.geom_size[geom])
             size = {"box": (2 * a, 2 * b, 2 * c), "sphere": (a,)}.get(types[kind], (a, 2 * b))
-            yield body, Shape(types[kind], size, pose, color)  # type: ignore[arg-type]
+            yield LinkShape(link, body, Shape(types[kind], size, pose, color))  # type: ignore[arg-type]
 
 
 def _geom_color(source: MjcfSource, geom: int) -> Color:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 from ce_gym.model.assets import assets_folder, robots
 from ce_gym.model.checks.robot import check_robot
@@ -17,7 +18,7 @@ from ce_gym.model.constraints import Constraint
 from ce_gym.model.description import Body, ContactMaterial, Frame, Gains, Pose, Robot
 from ce_gym.model.formats.identified import with_identified
 from ce_gym.model.formats.placement import compose, rotation_from_rpy, vec3
-from ce_gym.model.formats.pose import complete_pose
+from ce_gym.model.formats.pose import complete_pose, touching_height
 from ce_gym.model.formats.reading import Section, finite, frozen, read_yaml
 from ce_gym.model.formats.urdf import drives
 from ce_gym.model.formats.yaml.constraints import frame_named, read_constraints
@@ -33,7 +34,7 @@ _JOINT_PARAMETERS = {"joint_friction": "friction", "joint_stiffness": "stiffness
 _KEYS = (
     *("name", "urdf", "mjcf", "base", "sources", "notes", "kept_inertia", "gravity", "gears"),
     *("rotors", "constraints", "independent", "motors", "contacts", "material", "pose", "assembly", "gains", "tasks"),
-    *("capsules", "self_collisions", "elastic", "battery", "passive", "frames"),
+    *("capsules", "self_collisions", "elastic", "battery", "passive", "frames", "limits"),
     *_JOINT_PARAMETERS,
 )
 
@@ -51,7 +52,7 @@ def robot_from_yaml(path: Path) -> Robot:
     notes = list(links.robot.notes)
     bodies, gears = add_rotors(file.section("rotors"), links, library)
     bodies, urdf_gears = drives.add_rotors(bodies, links.drives, links.driven, notes)
-    bodies = _with_joint_parameters(file, bodies)
+    bodies = _with_limits(file.section("limits"), _with_joint_parameters(file, bodies))
     ties = (*gears, *urdf_gears, *read_constraints(file, bodies, links.frames))
     independent = _independent(file, links.robot, ties)
     bodies = _with_passive_joints(file, bodies, independent)
@@ -79,7 +80,7 @@ def robot_from_yaml(path: Path) -> Robot:
     )
     robot = replace(robot, gains=_gains(file.section("gains"), robot))
     check_robot(robot)
-    return robot
+    return _with_height(file.section("pose"), links.robot, robot)
 
 
 def _identified_robot(path: Path, file: Section) -> Robot:
@@ -106,6 +107,26 @@ def _with_joint_parameters(file: Section, bodies: tuple[Body, ...]) -> tuple[Bod
                 raise file.unknown(key, name, joints, "a link with a joint about or along one axis")
             parameters.setdefault(name, {})[parameter] = value
     return tuple(replace(body, joint=replace(body.joint, **parameters.get(body.name, {}))) for body in bodies)
+
+
+def _with_limits(section: Section, bodies: tuple[Body, ...]) -> tuple[Body, ...]:
+    """Return the bodies with the limits of joints in the YAML file."""
+    section.allow("torque", "velocity", "position")
+    joints = tuple(body.name for body in bodies if body.kind == "link" and body.joint.nv == 1)
+    limits: dict[str, dict[str, Any]] = {}
+    for key in (key for key in ("torque", "velocity") if key in section):
+        for name, value in _for_each(section, key, joints):
+            limits.setdefault(name, {})[key] = value
+    ranges = section.section("position")
+    for name, pattern in ranges.keys_for(joints).items():
+        lower, upper = ranges.vector(pattern, 2)
+        if lower > upper:
+            raise ranges.invalid(pattern, [lower, upper], "the lower limit first")
+        limits.setdefault(name, {})["position"] = (lower, upper)
+    for name in limits:
+        if name not in joints:
+            raise section.unknown("", name, joints, "a link with a joint about or along one axis")
+    return tuple(replace(body, joint=replace(body.joint, **limits.get(body.name, {}))) for body in bodies)
 
 
 def _with_passive_joints(file: Section, bodies: tuple[Body, ...], independent: tuple[str, ...]) -> tuple[Body, ...]:
@@ -157,10 +178,25 @@ def _assembly(file: Section, links: Robot, independent: tuple[str, ...]) -> Pair
 def _pose(section: Section, default: Pose, bodies: tuple[Body, ...], independent: tuple[str, ...]) -> Pose:
     """Return the standing pose; joints that the YAML file does not name keep their default."""
     section.allow("height", "joints")
+    if isinstance(section.get("height", 0.0), str) and section.get("height") != "auto":
+        raise section.invalid("height", section.get("height"), "a number [m] or auto")
     named = section.section("joints").numbers_for(independent)
     rest = ((joint, value) for joint, value in default.joints if joint in independent and joint not in named)
     joints = complete_pose((*named.items(), *rest), bodies, independent)
-    return Pose(section.number("height", default.height), joints)
+    height = default.height if section.get("height", "auto") == "auto" else section.number("height")
+    return Pose(height, joints)
+
+
+def _with_height(section: Section, links: Robot, robot: Robot) -> Robot:
+    """Return the robot at the height at which its lowest contact touches the ground, unless a file gives the height."""
+    choice = section.get("height", "auto" if links.pose.height == 0.0 else links.pose.height)
+    if choice != "auto" or not robot.floating:
+        return robot
+    height = touching_height(robot)
+    if height is None and "height" in section:
+        expected = "a number [m]: there are no contacts, or closed loops decide where they are"
+        raise section.invalid("height", "auto", expected)
+    return robot if height is None else replace(robot, pose=replace(robot.pose, height=height))
 
 
 def _material(file: Section, links: Robot) -> ContactMaterial:
