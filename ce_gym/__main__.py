@@ -193,6 +193,7 @@ def _new(args: argparse.Namespace) -> int:
 
 def _inspect(args: argparse.Namespace) -> int:
     from ce_gym.diagnostics.levels import levels_report
+    from ce_gym.diagnostics.robot import robot_report
     from ce_gym.diagnostics.standing import seconds_to_compile, standing_report
     from ce_gym.diagnostics.transmission import transmission_report
     from ce_gym.dynamics import Model
@@ -204,7 +205,7 @@ def _inspect(args: argparse.Namespace) -> int:
     if args.levels:
         print(levels_report(model))
         return 0
-    print(f"{model.describe()}\n", flush=True)
+    print(f"{model.describe()}\n\n{robot_report(model)}\n", flush=True)
     problems = missing(model.robot)
     notes = [note for note in model.robot.notes if note.startswith(READER_NOTES)]
     print("".join(f"{note}\n" for note in notes[:MOST_NOTES]), end="")

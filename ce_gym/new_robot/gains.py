@@ -1,4 +1,4 @@
-"""Torque limits, gains and task settings from a robot's weight, leg length, mass matrix and load in its standing pose.
+"""Torque limits, gains and task settings from a robot's weight, height, mass matrix and load in its standing pose.
 
 With the weight W and the height h of the centre of mass above the feet, a torque is compared with W h. By Froude's
 similarity, speeds grow with sqrt(g h) and times with sqrt(h / g), while angles stay the same.
@@ -7,18 +7,13 @@ similarity, speeds grow with sqrt(g h) and times with sqrt(h / g), while angles 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ce_gym.dynamics.standing import Standing, mass_matrix
-from ce_gym.model.description import ContactSphere, Robot
-from ce_gym.model.mechanism import Mechanism
-from ce_gym.new_robot.solids import Floats
+from ce_gym.dynamics.standing_load import Load, placeholders
+from ce_gym.model.description import Robot
 
-PLACEHOLDER = 8.0
-"""A torque limit above this many times weight times height of the centre of mass is a placeholder [-]."""
 LIKELY_TORQUE = 0.75
 """Torque limit in place of a placeholder, over weight times height of the centre of mass [-]."""
 STIFFNESS = 1.5
@@ -44,67 +39,6 @@ PERIODS = {True: 2.6, False: 4.0}
 """Gait period over sqrt(h / g) [-]."""
 CLEARANCE = 0.1
 """Height of swinging feet over the height of the centre of mass [-]."""
-
-
-@dataclass(frozen=True)
-class Load:
-    """The load of a robot in its standing pose.
-
-    Attributes:
-        weight: Weight [N].
-        height: Height of the centre of mass above the lowest contact [m]; above the base's origin with a fixed base.
-        inertias: Diagonal of the mass matrix, by joint [kg m^2 or kg].
-        torques: Torque that holds the joint while the feet share the weight, by joint [N m or N].
-    """
-
-    weight: float
-    height: float
-    inertias: dict[str, float]
-    torques: dict[str, float]
-
-    @property
-    def toppling(self) -> float:
-        """Weight times height [N m]."""
-        return self.weight * self.height
-
-
-def load_of(mechanism: Mechanism, standing: Standing, feet: Sequence[ContactSphere]) -> Load:
-    """Return the load in the standing pose; the feet share the weight with the smallest sum of squared forces."""
-    robot = mechanism.robot
-    M = mass_matrix(mechanism, standing)
-    gravity = np.array(robot.gravity)
-    pull, moment, mass = np.zeros(len(M)), np.zeros(3), 0.0
-    for body in (body for body in robot.bodies if body.name in standing.R):  # without eliminated rotors
-        at = standing.R[body.name] @ np.array(body.inertial.com)
-        pull += body.inertial.mass * _point_jacobian(standing, body.name, np.array(body.inertial.com)).T @ gravity
-        moment += body.inertial.mass * (standing.p[body.name] + at)
-        mass += body.inertial.mass
-    free = robot.layout.joints_v
-    holding = -pull
-    if robot.floating and feet:
-        J = np.concatenate([_point_jacobian(standing, c.body, np.array(c.position)) for c in feet])
-        forces = np.linalg.lstsq(J[:, :6].T, -pull[:6], rcond=None)[0]
-        holding = holding - J.T @ forces
-    joints = dict(zip(robot.independent, range(free, len(M)), strict=True))
-    height = moment[2] / mass - min((c.lowest_point(standing.p[c.body], standing.R[c.body]) for c in feet), default=0.0)
-    return Load(
-        mass * float(np.linalg.norm(gravity)),
-        abs(float(height)),
-        {name: float(M[row, row]) for name, row in joints.items()},
-        {name: float(holding[row]) for name, row in joints.items()},
-    )
-
-
-def _point_jacobian(standing: Standing, body: str, point: Floats) -> Floats:
-    """Return the world velocity of a point of a body for unit independent velocities, shape (3, nv)."""
-    angular, linear = standing.J[body][:3], standing.J[body][3:]
-    return standing.R[body] @ (linear + np.cross(angular.T, point).T)
-
-
-def placeholders(robot: Robot, load: Load) -> list[str]:
-    """Return the driven joints whose torque limit is infinite or far above what the robot's weight needs."""
-    limits = {name: robot.body(name).joint.torque for name in robot.driven}
-    return [name for name, torque in limits.items() if torque > PLACEHOLDER * load.toppling]
 
 
 def likely_torque(load: Load) -> float:

@@ -13,10 +13,11 @@ import numpy as np
 
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.standing import Standing, standing_pose
+from ce_gym.dynamics.standing_load import load_of, placeholders
 from ce_gym.model.description import ContactSphere, Pose, Robot
 from ce_gym.model.formats.pose import touching_height
 from ce_gym.new_robot.contacts import GuessedContact, foot_contacts, is_wheel, trunk_contacts
-from ce_gym.new_robot.gains import likely_gains, likely_torque, load_of, placeholders, velocity_settings
+from ce_gym.new_robot.gains import likely_gains, likely_torque, velocity_settings
 from ce_gym.new_robot.legs import Foot, bend_legs, find_feet, leg_of, limb_of, trunk_of
 from ce_gym.new_robot.solids import Floats, Solids, place
 

@@ -165,7 +165,7 @@ def _foot_names(robot: Robot, body: str) -> tuple[str, tuple[str, ...]] | None:
         matches = [name for name in names if re.search(word, name, re.IGNORECASE)]
         if matches:
             links = [name for name in (*frames, body) if re.search("|".join(FOOT_WORDS), name, re.IGNORECASE)]
-            return matches[0], tuple(links)
+            return min(matches, key=len), tuple(links)
     return None
 
 

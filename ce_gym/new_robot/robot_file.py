@@ -12,13 +12,13 @@ from typing import Any
 
 import yaml
 
+from ce_gym.dynamics.standing_load import PLACEHOLDER
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, file_error
 from ce_gym.model.formats.urdf.graph import UrdfGraph
 from ce_gym.model.formats.urdf.plus import robot_from_graph
 from ce_gym.model.load import load_robot
 from ce_gym.new_robot.contacts import GuessedContact
-from ce_gym.new_robot.gains import PLACEHOLDER
 from ce_gym.new_robot.guesses import Guesses, guess
 
 GUESS = "# GUESS"
