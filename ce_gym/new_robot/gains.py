@@ -16,7 +16,7 @@ from ce_gym.model.description import Robot
 
 LIKELY_TORQUE = 0.75
 """Torque limit in place of a placeholder, over weight times height of the centre of mass [-]."""
-STIFFNESS = 1.5
+STIFFNESS = 3.0
 """Sum of the position gains of one joint of all legs, over weight times height of the centre of mass [1/rad]."""
 SAG = 0.15
 """Largest sag of a joint under its load in the standing pose [rad]."""
@@ -37,6 +37,8 @@ YAW_RATES = {True: 0.2, False: 0.18}
 """Largest commanded yaw rate over sqrt(g / h) [-]."""
 PERIODS = {True: 2.6, False: 4.0}
 """Gait period over sqrt(h / g) [-]."""
+SHORTEST_PERIOD = 0.5
+"""Smallest gait period [s]: servos of small robots are slower than Froude's similarity asks for."""
 CLEARANCE = 0.1
 """Height of swinging feet over the height of the centre of mass [-]."""
 
@@ -79,7 +81,7 @@ def velocity_settings(robot: Robot, load: Load, leg_joints: Sequence[str], n_fee
     base_height = rounded(float(-10.0 / scale**4))
     settings: dict[str, Any] = {
         "command_range": [forward, sideways, [-yaw, yaw]],
-        "gait_period": rounded(float(PERIODS[biped] * np.sqrt(h / g))),
+        "gait_period": max(SHORTEST_PERIOD, rounded(float(PERIODS[biped] * np.sqrt(h / g)))),
     }
     rewards: dict[str, Any] = {
         "track_linear_velocity": {"weight": 2.5 if biped else 1.5, **tracking},

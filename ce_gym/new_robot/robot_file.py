@@ -110,7 +110,7 @@ def _rotors(robot: Robot, kind: str) -> str:
             [
                 "# Gears: the file has the reflected inertia (armature) of its motors, but no gear ratios, so level",
                 "# exact equals level coupled. Give the ratios that you know:",
-                f"# gears: {{{_yaml_name(joints[0])}: 9}}" if joints else "# gears: {}",
+                f"# gears: {{{', '.join(f'{_joint(robot, joint)}: 9' for joint in robot.driven[:2])}}}",
             ]
         )
     if not joints:

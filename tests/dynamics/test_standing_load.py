@@ -19,7 +19,9 @@ def with_joint(robot: Robot, name: str, **changes: object) -> Robot:
     def changed(joint: Joint) -> Joint:
         return replace(joint, **changes)  # type: ignore[arg-type]
 
-    return replace(robot, bodies=tuple(replace(b, joint=changed(b.joint)) if b.name == name else b for b in robot.bodies))
+    return replace(
+        robot, bodies=tuple(replace(b, joint=changed(b.joint)) if b.name == name else b for b in robot.bodies)
+    )
 
 
 def found(robot: Robot) -> list[str]:
@@ -58,7 +60,8 @@ def contact_poses(model):
 def test_tables_show_limits_gains_and_heights():
     text = robot_report(Model("mini_cheetah"))
     row = next(line for line in text.splitlines() if line.split()[:1] == ["FL_knee"] or "FL_knee" in line)
-    assert "20" in row.split() and "0.5" in row.split()
+    assert "20" in row.split()
+    assert "0.5" in row.split()
     assert "Findings: none" in text
     assert (axis_text(np.array([0.0, -1.0, 0.0])), axis_text(np.array([0.6, 0.0, -0.8]))) == ("-y", "0.60 0.00 -0.80")
 
@@ -69,14 +72,16 @@ def test_findings_name_what_is_wrong():
     assert found(robot) == []
     assert placeholders(robot, load_of(*_load_arguments(robot))) == []
     (line,) = found(with_joint(robot, joint, torque=1000.0))
-    assert line.startswith("torque limits like placeholders (1000)") and robot.joint_name(joint) in line
+    assert line.startswith("torque limits like placeholders (1000)")
+    assert robot.joint_name(joint) in line
     (line,) = found(with_joint(robot, joint, torque=1e-3))
     assert line.startswith("torque limits below the load")
     (line,) = found(replace(robot, contacts=tuple(c for c in robot.contacts if c.group != "torso")))
     assert line.startswith("no contact of group torso")
     heavy = replace(robot.bodies[1], inertial=replace(robot.bodies[1].inertial, mass=3.0))
     (line,) = found(replace(robot, bodies=(robot.bodies[0], heavy, *robot.bodies[2:])))
-    assert line.startswith("left and right differ in mass") and robot.bodies[1].name in line
+    assert line.startswith("left and right differ in mass")
+    assert robot.bodies[1].name in line
     bent = {**dict(robot.pose.joints), robot.independent[2]: -1.2}
     lines = found(replace(robot, pose=replace(robot.pose, joints=tuple(bent.items()))))
     assert any(line.startswith("feet off the ground") for line in lines)

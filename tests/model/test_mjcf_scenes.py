@@ -27,6 +27,19 @@ def test_a_scene_that_includes_its_robot_is_the_robot(tmp_path):
     assert robot.material.friction == 1.0  # of the pair: the larger of the two
 
 
+@pytest.mark.parametrize("name", ["dog", ""])
+@pytest.mark.parametrize("scene", ["dog scene", "scene", ""])
+def test_a_scene_has_the_name_of_its_robot(tmp_path, name, scene):
+    def model(text: str, name: str) -> str:
+        return text.replace("<mujoco>", f'<mujoco model="{name}">') if name else text
+
+    (tmp_path / "light.xml").write_text('<mujoco model="light"><worldbody><light pos="0 0 3"/></worldbody></mujoco>')
+    (tmp_path / "robot.xml").write_text(model(ROBOT, name))
+    (tmp_path / "scene.xml").write_text(model(SCENE.format('<include file="light.xml"/>'), scene))
+    assert load_robot(tmp_path / "scene.xml").name == (name or "robot")
+    assert load_robot(tmp_path / "robot.xml").name == (name or "robot")
+
+
 def test_a_scene_that_attaches_its_robot_is_the_robot(tmp_path):
     (tmp_path / "robot.xml").write_text(ROBOT)
     attach = f'{FLOOR}<frame pos="0 0 1"><attach model="robot" prefix="my_"/></frame>'

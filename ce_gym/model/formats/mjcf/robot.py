@@ -33,6 +33,7 @@ from ce_gym.model.formats.mjcf.contacts import read_contacts
 from ce_gym.model.formats.mjcf.equalities import locked_joints, read_constraints
 from ce_gym.model.formats.mjcf.independent import choose_independent, equality_rows, without_repeats
 from ce_gym.model.formats.mjcf.rotors import add_rotors
+from ce_gym.model.formats.mjcf.scenes import robot_name
 from ce_gym.model.formats.mjcf.source import MjcfSource, quaternion, read_mjcf, rotation, summary
 from ce_gym.model.formats.mjcf.unmodelled import report_unmodelled
 from ce_gym.model.formats.placement import named_frames, vec3
@@ -137,7 +138,7 @@ def _ratios(gears: Section, tree: MjcfTree, driven: Collection[str]) -> dict[str
 
 def _name(source: MjcfSource, path: Path) -> str:
     name = source.model.names[: source.model.names.index(b"\0")].decode()
-    return path.stem if name in ("", "MuJoCo Model") else name
+    return robot_name(path.stem if name in ("", "MuJoCo Model") else name, path)
 
 
 def _add_shapes(source: MjcfSource, tree: MjcfTree) -> None:

@@ -1,4 +1,4 @@
-"""Hints for MJCF in several files: a scene without its robot, a robot that needs its scene."""
+"""MJCF in several files: the name of the robot in a scene, hints for a scene without its robot and the reverse."""
 
 from __future__ import annotations
 
@@ -35,6 +35,23 @@ def robot_hint(path: Path) -> str:
     ]
     listed = ", ".join(names[:MOST_NAMED])
     return f"; this may be a scene for the robot in {listed}: read that, or <include> it here" if names else ""
+
+
+def robot_name(name: str, path: Path) -> str:
+    """Return the name of the robot in a file: for a scene, the name of the model with joints that the file includes.
+
+    Args:
+        name: Name of the file's model.
+        path: The file.
+    """
+    if "scene" not in name.lower():
+        return name
+    for part in re.findall(r"<include\b[^>]*\bfile\s*=\s*[\"']([^\"']+)", read_text(path, "an MJCF file")):
+        included = path.parent / part
+        if included.is_file() and re.search(r"<(freejoint|joint)\b", text := read_text(included, "an MJCF file")):
+            model = re.search(r"<mujoco\b[^>]*\bmodel\s*=\s*[\"']([^\"']+)", text)
+            return model[1] if model else included.stem
+    return name
 
 
 def _includes(text: str, part: Path) -> bool:
