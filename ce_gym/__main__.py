@@ -132,8 +132,8 @@ def _parser() -> argparse.ArgumentParser:
     new = commands.add_parser(
         "new",
         help="start a robot of one's own from its URDF or MJCF file",
-        description="Write a commented YAML file beside a URDF or MJCF file, with feet, a standing pose and gains\n"
-        "guessed and marked, and say how to go on.",
+        description="Write a commented YAML file beside a URDF or MJCF file, with feet, trunk, standing pose, torque\n"
+        "limits, gains and commands guessed and marked, and a picture, and say how to go on.",
         epilog=examples("new my_robot.urdf", "new my_robot.xml --out mine.yaml"),
     )
     new.add_argument("file", type=Path, metavar="FILE", help="a URDF or MJCF file")
@@ -173,10 +173,13 @@ def _list(args: argparse.Namespace) -> int:
 
 def _new(args: argparse.Namespace) -> int:
     from ce_gym.envs.custom import id_stem, missing, zero_limits
+    from ce_gym.new_robot.picture import write_picture
     from ce_gym.new_robot.robot_file import write_new_robot
 
     path, robot, guessed = write_new_robot(args.file, args.out)
     guesses = path.read_text(encoding="utf-8").count("GUESS") - 1
+    if write_picture(path.with_suffix(".png"), robot):
+        print(f"{path.with_suffix('.png')}: a picture with contacts, and axes of the base and the feet")
     print(f"{path}: {len(robot.independent)} joints, {len(robot.contacts)} contact spheres, {guesses} lines of guesses")
     for problem in (*missing(robot), *guessed.warnings):
         print(f"  check: {problem}")

@@ -171,6 +171,14 @@ def robot_commands(
             yield three.set_property(path, "visible", False)
 
 
+def mark_commands(robot: Robot, root: str, marks: Mapping[str, Sequence[Shape]]) -> Iterator[Command]:
+    """Draw further shapes on bodies, given by name of the body."""
+    paths = body_paths(robot, root)
+    for name, shapes in marks.items():
+        for index, shape in enumerate(shapes):
+            yield _shape_command(f"{paths[name]}/mark_{index}", shape, shape.color[:3], shape.color[3])
+
+
 def _part_commands(
     path: str, part: Part, robot: Robot, paths: dict[str, str], color: Color, opacity: float
 ) -> Iterator[Command]:

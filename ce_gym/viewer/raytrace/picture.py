@@ -5,14 +5,16 @@ Embree computes the first hit of each ray. The picture depends on the pose alone
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.model.description import Shape
 from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.page.lights_and_camera import FADING, FIELD_OF_VIEW, HORIZON, STEEP, SUN, VIEW, ZENITH
-from ce_gym.viewer.page.robot import body_paths, extent, pose_bodies, robot_commands
+from ce_gym.viewer.page.robot import body_paths, extent, mark_commands, pose_bodies, robot_commands
 from ce_gym.viewer.raytrace.ground import Field, Plane
 from ce_gym.viewer.raytrace.mesh import mesh_of
 from ce_gym.viewer.raytrace.rays import Array, Embree, Floats
@@ -67,17 +69,26 @@ class Picture:
         width: Width of the picture [pixels].
         height: Height of the picture [pixels].
         terrain: The ground; None for the plane z = 0.
+        marks: Further shapes to draw on bodies, by name of the body.
 
     Raises:
         ViewerError: embreex is not installed.
     """
 
     def __init__(
-        self, model: Model, q: Array, *, width: int = 640, height: int = 480, terrain: Terrain | None = None
+        self,
+        model: Model,
+        q: Array,
+        *,
+        width: int = 640,
+        height: int = 480,
+        terrain: Terrain | None = None,
+        marks: Mapping[str, Sequence[Shape]] | None = None,
     ) -> None:
         self._embree, self._model, robot = Embree(), model, model.robot
         self._ground = Field(self._embree, terrain) if terrain else Plane()
-        self._mesh = mesh_of(robot_commands(robot, ""), {p: i for i, p in enumerate(body_paths(robot, "").values())})
+        commands = [*robot_commands(robot, ""), *mark_commands(robot, "", marks or {})]
+        self._mesh = mesh_of(commands, {p: i for i, p in enumerate(body_paths(robot, "").values())})
         positions, rotations = pose_bodies(model, [q])
         box = extent(robot, positions[0], rotations[0])
         self._fixed, self._radius = None if robot.floating else box.middle[:2], box.radius
