@@ -90,6 +90,10 @@ def findings(model: Model, standing: Standing, load: Load) -> Iterator[str]:
     weak = [name for name, limit in limits.items() if 0.0 < limit < abs(load.torques.get(name, 0.0))]
     if robot.floating and weak:
         yield f"torque limits below the load of the standing pose: {_names(robot, weak)}"
+    kd = dict(robot.gains.kd)
+    undamped = [name for name in robot.driven if kd.get(name) == 0.0 and robot.body(name).joint.damping == 0.0]
+    if undamped:
+        yield f"no velocity gain and no damping: {_names(robot, undamped)}"
     if robot.unknown_ratios:
         yield f"gear ratios unknown: {_listed(list(robot.unknown_ratios))}; `gears` or `rotors` give them"
     if robot.floating:

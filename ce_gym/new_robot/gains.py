@@ -65,12 +65,12 @@ def likely_gains(robot: Robot, load: Load, leg_joints: Sequence[str], n_feet: in
     return gains
 
 
-def velocity_settings(robot: Robot, load: Load, leg_joints: Sequence[str], n_feet: int) -> dict[str, Any]:
+def velocity_settings(robot: Robot, load: Load, leg_joints: Sequence[str], biped: bool) -> dict[str, Any]:
     """Return arguments of the velocity task that fit the robot's size.
 
     A robot with two feet takes its steps by a clock, as the humanoids of this package do.
     """
-    g, h, biped = float(np.linalg.norm(robot.gravity)), load.height, n_feet == 2
+    g, h = float(np.linalg.norm(robot.gravity)), load.height
     speed, scale = np.sqrt(g * h), np.sqrt(h / REFERENCE_HEIGHT)
     forward, sideways = ([rounded(float(x * speed)) for x in bounds] for bounds in SPEEDS[biped])
     yaw = rounded(float(YAW_RATES[biped] * np.sqrt(g / h)))

@@ -25,6 +25,8 @@ MOST_CONTACTS = 60
 """More contacts of an MJCF file than this are replaced: the time to compile grows with the square of their number."""
 UNEVEN = 0.002
 """Largest difference of the heights of feet in the standing pose [m]."""
+BACKWARDS = 0.01
+"""Feet point backwards if the middle of each sole is further behind the ankle [m]."""
 CLEAR = 0.01
 """A torso contact that is lower in the standing pose is reported [m]."""
 
@@ -91,6 +93,8 @@ def guess(robot: Robot, has_pose: bool) -> Guesses:
         warnings += [f"contact {c.name!r}: {c.basis}; check its place" for c in contacts if not c.reliable]
     soles_found = [c for c in spheres if c.group == "foot"]
     warnings += _warnings_on_heights(robot, spheres, standing)
+    ankles = [leg.foot.body for foot in feet if (leg := leg_of(robot, foot, trunk, drawn, False)) and leg.ankle]
+    warnings += _warnings_on_soles(spheres, standing, [body for body in ankles if body not in wheels])
     lowest = min((c.lowest_point(standing.p[c.body], standing.R[c.body]) for c in spheres), default=-robot.pose.height)
     height = round(-lowest, 6) + 0.0 if robot.floating else robot.pose.height
     pose = Pose(height, tuple(angles.items()), robot.pose.balls)
@@ -108,7 +112,7 @@ def guess(robot: Robot, has_pose: bool) -> Guesses:
         dict.fromkeys(unknown, likely_torque(load)),
         {name: robot.body(name).joint.torque for name in unknown},
         {} if robot.gains.kp else likely_gains(robot, load, leg_joints, len(feet) or 1),
-        velocity_settings(robot, load, leg_joints, len(feet)) if feet else {},
+        velocity_settings(robot, load, leg_joints, len(feet) == 2 and not wheels) if feet else {},
         tuple(wheels),
         (*warnings, *(note for note in robot.notes if "inclination of the base" in note)),
     )
@@ -143,6 +147,30 @@ def _reason_to_replace(robot: Robot, feet: Sequence[Foot], wheels: Sequence[str]
     if len(robot.contacts) > MOST_CONTACTS:
         return f"the MJCF file has {len(robot.contacts)} contacts, which take minutes to compile"
     return ""
+
+
+def _warnings_on_soles(spheres: Sequence[ContactSphere], standing: Standing, ankles: Sequence[str]) -> list[str]:
+    """Return lines on feet with ankles that touch in one point, and on feet that point backwards.
+
+    Args:
+        spheres: The contacts.
+        standing: The standing pose.
+        ankles: Bodies of the feet that an ankle moves.
+    """
+    soles = {body: [c for c in spheres if c.body == body and c.group == "foot"] for body in ankles}
+    lines = [
+        f"foot {body!r} has an ankle and touches the ground in one point: turn the ankle until its sole is flat"
+        for body, contacts in soles.items()
+        if len(contacts) == 1
+    ]
+    ahead = [
+        float(np.mean([(standing.R[body] @ np.array(c.position))[0] for c in contacts]))
+        for body, contacts in soles.items()
+        if len(contacts) > 1
+    ]
+    if ahead and max(ahead) < -BACKWARDS:
+        lines.append("the feet point backwards: x of the base must point forward for the commands of tasks")
+    return lines
 
 
 def _warnings_on_heights(robot: Robot, spheres: Sequence[ContactSphere], standing: Standing) -> list[str]:

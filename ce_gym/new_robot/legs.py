@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from ce_gym.dynamics.standing import Standing
+from ce_gym.model.clusters import cluster_tree
 from ce_gym.model.description import Body, Robot
 from ce_gym.new_robot.solids import Floats, Solids, extremes
 
@@ -191,7 +192,9 @@ def _length(limb: Sequence[str], standing: Standing) -> float:
 
 def leg_of(robot: Robot, foot: Foot, trunk: Sequence[str], drawn: Standing, is_wheel: bool) -> Leg | None:
     """Return the joints that bend a leg; None if there are fewer than two that turn freely about the lateral axis."""
-    tied = {name for tie in robot.constraints for name in tie.bodies if robot.body(name).kind == "link"}
+    links = {body.name for body in robot.bodies if body.kind == "link"}
+    clusters = [links.intersection(cluster.bodies) for cluster in cluster_tree(robot).clusters]
+    tied = {name for cluster in clusters for name in cluster if len(cluster) > 1}  # a rotor leaves its joint free
     names = limb_of(robot, foot.body, trunk)[: -1 if is_wheel else None]
     bending = [name for name in names if robot.body(name).joint.type == "revolute" and _lateral(robot, name, drawn)]
     if len(bending) < 2 or any(name not in robot.independent or name in tied for name in bending):

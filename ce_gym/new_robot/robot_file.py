@@ -15,6 +15,7 @@ import yaml
 from ce_gym.dynamics.standing_load import PLACEHOLDER
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, file_error
+from ce_gym.model.formats.pose import complete_pose
 from ce_gym.model.formats.urdf.graph import UrdfGraph
 from ce_gym.model.formats.urdf.plus import robot_from_graph
 from ce_gym.model.load import load_robot
@@ -47,7 +48,8 @@ def write_new_robot(path: Path, out: Path | None = None) -> tuple[Path, Robot, G
     if out.exists():
         raise file_error(out, "exists already", "a free name; --out gives another")
     robot = robot_from_graph(UrdfGraph(path)) if kind == "urdf" else load_robot(path)  # without a YAML file beside it
-    has_pose = kind == "mjcf" and any(angle for _, angle in robot.pose.joints)
+    nearest = dict(complete_pose((), robot.bodies, robot.independent))  # to zero, the pose without a keyframe
+    has_pose = kind == "mjcf" and any(abs(x - nearest.get(joint, 0.0)) > 1e-6 for joint, x in robot.pose.joints)
     guesses = guess(robot, has_pose)
     out.write_text(new_robot(robot, guesses, kind, _relative_path(path, out.parent)), encoding="utf-8")
     try:

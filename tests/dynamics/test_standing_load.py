@@ -76,6 +76,9 @@ def test_findings_name_what_is_wrong():
     assert robot.joint_name(joint) in line
     (line,) = found(with_joint(robot, joint, torque=1e-3))
     assert line.startswith("torque limits below the load")
+    undamped = tuple((name, 0.0 if name == joint else kd) for name, kd in robot.gains.kd)
+    (line,) = found(replace(with_joint(robot, joint, damping=0.0), gains=replace(robot.gains, kd=undamped)))
+    assert line == f"no velocity gain and no damping: {robot.joint_name(joint)}"
     (line,) = found(replace(robot, contacts=tuple(c for c in robot.contacts if c.group != "torso")))
     assert line.startswith("no contact of group torso")
     heavy = replace(robot.bodies[1], inertial=replace(robot.bodies[1].inertial, mass=3.0))

@@ -145,6 +145,7 @@ def test_wheels_roll(tmp_path):
     assert sorted(c.position[1] for c in rims) == pytest.approx([0.0, 0.04], abs=1e-6)
     assert robot.pose.height == pytest.approx(0.17, abs=1e-5)
     assert "rolls: true" in text
+    assert "gait_phase" not in make_program(tmp_path / "r.yaml", "velocity", transmission="none").task.observations
 
 
 def test_a_leg_without_a_foot_is_reported(tmp_path):

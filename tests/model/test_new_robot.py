@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import shutil
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mjcf_files import GEOMS
 
-from ce_gym.__main__ import main
+from ce_gym.__main__ import main, run
 from ce_gym.dynamics import Model
 from ce_gym.envs.custom import missing
 from ce_gym.model import RobotError, load_robot
+from ce_gym.new_robot.picture import marks_of, write_picture
 from ce_gym.new_robot.robot_file import write_new_robot
+from ce_gym.viewer.raytrace.picture import Picture
 
 PUP = Path(__file__).parents[1] / "data" / "own_robot" / "pup.urdf"
 
@@ -66,6 +69,34 @@ def test_an_mjcf_file_keeps_what_it_says(tmp_path):
     assert robot.pose.height == pytest.approx(0.4 * np.cos(0.25) + 0.02, abs=1e-5), "feet just touch"
 
 
+def test_a_picture_shows_the_contacts(pup, tmp_path):
+    """Without the red and orange marks, the picture of the robot has neither colour."""
+    pytest.importorskip("embreex")
+    _, robot, _ = write_new_robot(pup)
+    model = Model(robot)
+    bare, marked = (Picture(model, model.standing_q, marks=marks) for marks in (None, marks_of(robot)))
+    red, bare_red = (
+        (drawn[..., 0] > 3.0 * drawn[..., 1:].max(-1)).sum()
+        for drawn in (picture.draw(model.standing_q).astype(float) for picture in (marked, bare))
+    )
+    assert red > 100 > bare_red
+    assert write_picture(tmp_path / "pup.png", robot)
+    assert (tmp_path / "pup.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_warning_is_printed_once(capsys):
+    def work() -> int:
+        for _ in range(3):
+            warnings.warn("the same", stacklevel=1)
+        warnings.warn("another", stacklevel=1)
+        return 0
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert run(work) == 0
+    assert capsys.readouterr().err == "ce_gym: warning: the same\nce_gym: warning: another\n"
+
+
 def test_what_it_refuses(pup, tmp_path):
     write_new_robot(pup)
     with pytest.raises(RobotError, match=r"pup\.yaml: exists already"):
@@ -79,6 +110,7 @@ def test_the_command_says_how_to_go_on(pup, capsys):
     out = capsys.readouterr().out
     assert "8 joints, 12 contact spheres" in out
     assert "train my_robots:ce_gym/PupVelocity-v0" in out
+    assert ("a picture" in out) == pup.with_suffix(".png").is_file()
     assert main(["inspect", str(pup.with_suffix(".yaml")), "--no-errors"]) == 0
     assert "Environments: it has what every task needs" in capsys.readouterr().out
     assert main(["inspect", "mit_humanoid_leg", "--no-errors"]) == 0
