@@ -35,10 +35,12 @@ SPEEDS = {True: ((-0.15, 0.25), (-0.1, 0.1)), False: ((-0.55, 0.55), (-0.25, 0.2
 """Commanded forward and sideways speeds over sqrt(g h), of bipeds and of others [-]."""
 YAW_RATES = {True: 0.2, False: 0.18}
 """Largest commanded yaw rate over sqrt(g / h) [-]."""
+FASTEST_TURN = {True: 0.7, False: 1.5}
+"""Largest commanded yaw rate of bipeds and of others [rad/s]: servos of small robots limit it."""
 PERIODS = {True: 2.6, False: 4.0}
 """Gait period over sqrt(h / g) [-]."""
 SHORTEST_PERIOD = 0.5
-"""Smallest gait period [s]: servos of small robots are slower than Froude's similarity asks for."""
+"""Smallest gait period [s]: servos of small robots are slow."""
 CLEARANCE = 0.1
 """Height of swinging feet over the height of the centre of mass [-]."""
 
@@ -73,7 +75,7 @@ def velocity_settings(robot: Robot, load: Load, leg_joints: Sequence[str], biped
     g, h = float(np.linalg.norm(robot.gravity)), load.height
     speed, scale = np.sqrt(g * h), np.sqrt(h / REFERENCE_HEIGHT)
     forward, sideways = ([rounded(float(x * speed)) for x in bounds] for bounds in SPEEDS[biped])
-    yaw = rounded(float(YAW_RATES[biped] * np.sqrt(g / h)))
+    yaw = min(FASTEST_TURN[biped], rounded(float(YAW_RATES[biped] * np.sqrt(g / h))))
     largest = max(abs(x) for x in (*forward, *sideways))
     torques = rounded(-1e-4 * (REFERENCE_TORQUE / load.toppling) ** 2)
     tracking = {"width": rounded(0.25 * min(1.0, largest) ** 2)}

@@ -53,7 +53,7 @@ def test_every_task_at_every_level_has_an_id(dog):
 
 
 def test_the_environment_is_that_robot_s(dog):
-    path = dog(("height: ", "height: 0.25 #"))
+    path = dog(("height: ", "height: 0.31 #"))
     ids = register_robot(path, name="flat dog")
     assert ids[0] == "ce_gym/FlatDogVelocity-v0"
     env = gymnasium.make("ce_gym/FlatDogVelocity-None-v0")

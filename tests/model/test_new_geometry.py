@@ -117,7 +117,7 @@ def test_a_sole_has_the_corners_of_its_mesh(tmp_path, tag):
         parts += [link(f"{side}_thigh", 1.0), link(f"{side}_shin", 0.6), link(f"{side}_end", 0.4, shape(mesh, tag=tag))]
         parts += [link(f"{side}_sole"), joint(f"{side}_end", f"{side}_sole", "0.03 0 -0.06")]
         parts.append(joint("base", f"{side}_thigh", f"0 {y} -0.2", "revolute"))
-        parts.append(joint(f"{side}_thigh", f"{side}_shin", "0 0 -0.3", "revolute", "-0.1 2 40"))
+        parts.append(joint(f"{side}_thigh", f"{side}_shin", "0 0 -0.3", "revolute", "-2 2 40"))
         parts.append(joint(f"{side}_shin", f"{side}_end", "0 0 -0.3", "revolute", "-1 1 40"))
     robot, text, warnings = new(tmp_path, f'<robot name="biped">{"".join(parts)}</robot>')
     corners = sorted(c.position for c in robot.contacts if c.body == "l_end")
