@@ -13,9 +13,9 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
-from ce_gym.console import InputError, Parser, examples, file_error, print_anything
+from ce_gym.console import InputError, Parser, add_force_argument, examples, file_error, path, print_anything
+from ce_gym.files import guarded, set_force
 from ce_gym.identify.command import add_identify_command
 from ce_gym.learn.commands.evaluate import (
     add_card_command,
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run(work: Callable[[], int]) -> int:
     """Do the work of a command and return its exit code: 2 after an error that the user can fix, 130 after Ctrl-C."""
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), guarded():
             shown: set[str] = set()
             warnings.showwarning = lambda message, *_, **__: _show_once(str(message), shown)
             return work()
@@ -89,6 +89,7 @@ def _run(argv: list[str]) -> int:
     if argv[0] == "bench":  # has its own parser, so its options must not meet ours
         return _bench(argv[1:])
     args = _parser().parse_args(argv)
+    set_force(getattr(args, "force", False))
     return args.run(args)
 
 
@@ -136,10 +137,11 @@ def _parser() -> argparse.ArgumentParser:
         "limits, gains and commands guessed and marked, and a picture, and say how to go on.",
         epilog=examples("new my_robot.urdf", "new my_robot.xml --out mine.yaml"),
     )
-    new.add_argument("file", type=Path, metavar="FILE", help="a URDF or MJCF file")
+    new.add_argument("file", type=path, metavar="FILE", help="a URDF or MJCF file")
     new.add_argument(
-        "--out", type=Path, metavar="YAML", help="the file to write; by default beside FILE, ending in .yaml"
+        "--out", type=path, metavar="YAML", help="the file to write; by default beside FILE, ending in .yaml"
     )
+    add_force_argument(new)
     new.set_defaults(run=_new)
     add_train_command(commands)
     add_evaluate_command(commands)
@@ -173,6 +175,7 @@ def _list(args: argparse.Namespace) -> int:
 
 def _new(args: argparse.Namespace) -> int:
     from ce_gym.envs.custom import id_stem, missing, zero_limits
+    from ce_gym.model import RobotError
     from ce_gym.new_robot.picture import write_picture
     from ce_gym.new_robot.robot_file import write_new_robot
 
@@ -185,11 +188,16 @@ def _new(args: argparse.Namespace) -> int:
         print(f"  check: {problem}")
     for line in zero_limits(robot):
         print(f"  {line}")
+    try:
+        stem = id_stem(robot)
+    except RobotError as error:
+        print(f"  {error}")
+        return 0
     print(
         f"Go through the file; then\n  python -m ce_gym inspect {path}\n"
         "and, to train, with a module that registers it:\n"
         f"  echo 'import ce_gym; ce_gym.register_robot(\"{path}\")' > my_robots.py\n"
-        f"  PYTHONPATH=. python -m ce_gym train my_robots:{id_stem(robot)}Velocity-v0"
+        f"  PYTHONPATH=. python -m ce_gym train my_robots:{stem}Velocity-v0"
     )
     return 0
 

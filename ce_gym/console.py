@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
+from ce_gym.files import check_output, json_kind, write_file
+
 T = TypeVar("T")
 
 Table = list[list[str]]
@@ -140,10 +142,33 @@ def add_threads_argument(parser: Any) -> None:
     parser.add_argument("--threads", type=THREADS, metavar="N", help="processor threads (default: all cores)")
 
 
-def add_json_argument(parser: argparse.ArgumentParser) -> None:
+def path(text: str) -> Path:
+    """Read the name of a file or folder from the command line."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError(f"{text!r}; expected a name")
+    return Path(text)
+
+
+def add_force_argument(parser: Any) -> None:
+    """Add `--force`, see `ce_gym.files`."""
+    text = "replace files of other kinds, and finished runs; never a file that the command reads"
+    parser.add_argument("--force", action="store_true", help=text)
+
+
+def add_json_argument(parser: Any) -> None:
     """Add `--json`, the argument of `print_result`."""
     text = "write the result to FILE as JSON as well; without FILE, print JSON and nothing else"
-    parser.add_argument("--json", nargs="?", const="-", metavar="FILE", help=text)
+    parser.add_argument("--json", type=lambda name: str(path(name)), nargs="?", const="-", metavar="FILE", help=text)
+
+
+def check_json(json_file: str | None) -> None:
+    """Check the file of `--json` before the result is computed.
+
+    Raises:
+        OSError: If the file may not be replaced.
+    """
+    if json_file not in (None, "-"):
+        check_output(Path(str(json_file)), json_kind('{\n  "'))
 
 
 def print_result(result: Any, text: str, json_file: str | None) -> None:
@@ -155,12 +180,12 @@ def print_result(result: Any, text: str, json_file: str | None) -> None:
         json_file: Value of `--json`: None, a file, or "-" for JSON instead of text.
 
     Raises:
-        OSError: If the file cannot be written.
+        OSError: If the file cannot be written or replaced.
     """
     data = json.dumps(result, indent=2)
     print(data if json_file == "-" else text)
     if json_file not in (None, "-"):
-        Path(str(json_file)).write_text(data + "\n", encoding="utf-8")
+        write_file(str(json_file), data + "\n", json_kind(data))
 
 
 def markdown(table: Table) -> str:

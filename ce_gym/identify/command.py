@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
 from typing import Any
 
-from ce_gym.console import examples
+from ce_gym.console import add_force_argument, examples, path
+from ce_gym.files import ESTIMATES, LOG, PAGE, check_output, write_file
 from ce_gym.model.errors import file_error
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 
@@ -33,7 +33,7 @@ def add_identify_command(subparsers: Any) -> None:
         ),
     )
     parser.add_argument("robot", metavar="ROBOT", help="name of a robot, or path of its YAML file")
-    parser.add_argument("log", type=Path, metavar="LOG", help="a CSV file")
+    parser.add_argument("log", type=path, metavar="LOG", help="a CSV file")
     parser.add_argument(
         "--simulate", type=float, metavar="SECONDS", help="do not estimate: write a simulated LOG of this duration"
     )
@@ -49,8 +49,9 @@ def add_identify_command(subparsers: Any) -> None:
     parser.add_argument(
         "--encoders", choices=ENCODERS, default="joints", help="with --simulate, place of encoders (default joints)"
     )
-    parser.add_argument("--out", type=Path, metavar="YAML", help="default: beside LOG")
-    parser.add_argument("--html", type=Path, metavar="FILE", help="default: beside LOG")
+    parser.add_argument("--out", type=path, metavar="YAML", help="default: beside LOG")
+    parser.add_argument("--html", type=path, metavar="FILE", help="default: beside LOG")
+    add_force_argument(parser)
     parser.set_defaults(run=run)
 
 
@@ -61,9 +62,10 @@ def run(args: argparse.Namespace) -> int:
     from ce_gym.identify.log import read_log
     from ce_gym.identify.page import page
     from ce_gym.identify.yaml_output import check_base, report, to_yaml
+    from ce_gym.model import load_robot
 
     if args.simulate is not None:
-        _check_new("LOG", args.log, [Path(args.robot)])
+        check_output(args.log, LOG)
         _check_range("--simulate", args.simulate, 1.0, 3600.0)
         options = {"control": args.control, "transmission": args.transmission, "encoders": args.encoders}
         options |= OSCILLATING if args.transmission == ELASTIC else {}
@@ -71,13 +73,15 @@ def run(args: argparse.Namespace) -> int:
         return 0
     _check_range("--window", args.window, 0.01, 60.0)
     _check_range("--substep", args.substep, 1e-6, 0.1)
-    out, html = args.out or args.log.with_suffix(".yaml"), args.html or args.log.with_suffix(".html")
-    for option, file in (("--out", out), ("--html", html)):
-        _check_new(option, file, [Path(args.robot), args.log])
     check_base(args.robot)
+    load_robot(args.robot)  # its files are then known, and are not replaced
+    log = read_log(args.log)
+    out, html = args.out or args.log.with_suffix(".yaml"), args.html or args.log.with_suffix(".html")
+    for file, kind in ((out, ESTIMATES), (html, PAGE)):
+        check_output(file, kind)
     result = identify(
         args.robot,
-        read_log(args.log),
+        log,
         control=args.control,
         transmission=args.transmission,
         kinds=args.parameters,
@@ -89,16 +93,10 @@ def run(args: argparse.Namespace) -> int:
     base = args.robot
     if base.endswith((".yaml", ".yml")):
         base = os.path.relpath(base, out.resolve().parent)
-    out.write_text(to_yaml(result, base), encoding="utf-8")
-    html.write_text(page(result), encoding="utf-8")
+    write_file(out, to_yaml(result, base), ESTIMATES)
+    write_file(html, page(result), PAGE)
     print(f"{out}\n{html}")
     return 0
-
-
-def _check_new(option: str, file: Path, inputs: list[Path]) -> None:
-    """Check that no input file is overwritten."""
-    if any(file.resolve() == other.resolve() for other in inputs):
-        raise file_error("identify", f"{option} {file} would replace an input file", "another name")
 
 
 def _check_range(option: str, value: float, low: float, high: float) -> None:

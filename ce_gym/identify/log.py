@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.files import LOG, written
 from ce_gym.model.errors import RobotError, file_error, printable
 from ce_gym.model.formats.text_file import read_text
 
@@ -64,7 +65,8 @@ class Log:
         names = [f"command:{name}" for name in self.commanded] + [f"{kind}:{name}" for kind, name in self.measured]
         rows = np.column_stack([np.arange(len(self.values)) * self.dt, self.commands, self.values])
         header = ",".join(["time", *names])
-        np.savetxt(path, rows, fmt="%.9g", delimiter=",", header=header, comments="")
+        with written(path, LOG) as file:
+            np.savetxt(file, rows, fmt="%.9g", delimiter=",", header=header, comments="")
         return Path(path)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from ce_gym.dynamics.standing_load import PLACEHOLDER
+from ce_gym.files import ROBOT, check_output, written
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, file_error
 from ce_gym.model.formats.pose import complete_pose
@@ -45,20 +46,21 @@ def write_new_robot(path: Path, out: Path | None = None) -> tuple[Path, Robot, G
     if kind is None:
         raise file_error(path, f"file type {path.suffix!r}", "a file that ends in .urdf or .xml")
     out = path.with_suffix(".yaml") if out is None else out
-    if out.exists():
-        raise file_error(out, "exists already", "a free name; --out gives another")
+    check_output(out, ROBOT)
     robot = robot_from_graph(UrdfGraph(path)) if kind == "urdf" else load_robot(path)  # without a YAML file beside it
     nearest = dict(complete_pose((), robot.bodies, robot.independent))  # to zero, the pose without a keyframe
     has_pose = kind == "mjcf" and any(abs(x - nearest.get(joint, 0.0)) > 1e-6 for joint, x in robot.pose.joints)
     guesses = guess(robot, has_pose)
-    out.write_text(new_robot(robot, guesses, kind, _relative_path(path, out.parent)), encoding="utf-8")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # shown when `path` was read
-            return out, load_robot(out), guesses
-    except RobotError:  # leave no broken file
-        out.unlink()
-        raise
+    text = new_robot(robot, guesses, kind, _relative_path(path, out.parent))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # shown when `path` was read
+        with written(out, ROBOT) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+            try:
+                load_robot(temporary)
+            except RobotError as error:
+                raise RobotError(str(error).replace(str(temporary), str(out))) from None
+        return out, load_robot(out), guesses
 
 
 def _yaml_name(name: str) -> str:

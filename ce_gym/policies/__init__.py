@@ -8,7 +8,7 @@ from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.exports import export_policy
 from ce_gym.policies.files import load_policy, read_actor, write_npz
 from ce_gym.policies.height_maps import keep_map, with_map
-from ce_gym.policies.places import WHERE, find_policy, locate_policy, shelf, shipped_policies
+from ce_gym.policies.places import WHERE, find_policy, locate_policy, policy_name, shelf, shipped_policies
 from ce_gym.policies.records import RECORD_KEY, environment_record
 from ce_gym.policies.robot_data import observation_in_words
 from ce_gym.policies.saving import save
@@ -36,6 +36,7 @@ __all__ = [
     "locate_policy",
     "observation_in_words",
     "parse_yaml",
+    "policy_name",
     "read_actor",
     "read_weights",
     "registered",

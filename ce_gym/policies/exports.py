@@ -12,11 +12,14 @@ The networks of all formats take observations (n, n_obs) and return clipped mean
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+from ce_gym.files import ONNX, POLICY, Kind, check_output, json_kind, write_file
 from ce_gym.policies.actor import Actor
 from ce_gym.policies.c_header import to_c
 from ce_gym.policies.environments import environment_of
@@ -29,7 +32,9 @@ WITHOUT_SOURCES = "ce_gym policy specification, version 1"
 """Format of specifications in which some observation blocks have no source, and joints the names of links."""
 
 
-def export_policy(path: str | Path, out: Path) -> dict[str, Any]:
+def export_policy(
+    path: str | Path, out: Path, env: str | None = None, env_kwargs: Mapping[str, Any] = MappingProxyType({})
+) -> dict[str, Any]:
     """Write a policy to `out` in the format of its suffix, and its specification beside it as JSON.
 
     Only weights and the record are read from the policy; no pickled code is run.
@@ -37,6 +42,8 @@ def export_policy(path: str | Path, out: Path) -> dict[str, Any]:
     Args:
         path: See `ce_gym.load_policy`.
         out: A file that ends in .onnx, .pt, .h or .npz; the suffix of the specification is `.json`.
+        env: See `ce_gym.load_policy`.
+        env_kwargs: See `ce_gym.load_policy`.
 
     Returns:
         The specification.
@@ -48,17 +55,20 @@ def export_policy(path: str | Path, out: Path) -> dict[str, Any]:
     file = locate_policy(path)
     if out.suffix not in WRITERS:
         raise PolicyError(f"{out}: expected a name that ends in one of {', '.join(WRITERS)}")
+    if file.suffix == out.suffix == ".onnx":
+        record = load_policy(file).record
+        content = file.read_bytes()
+    else:
+        actor, record = read_actor(file, env, env_kwargs)
+        record = complete_record(record)
+        content = WRITERS[out.suffix](actor, record)
+    specification = json.dumps(record["policy_spec"], indent=2) + "\n"
     try:
-        if file.suffix == out.suffix == ".onnx":
-            record = load_policy(file).record
-            out.write_bytes(file.read_bytes())
-        else:
-            actor, record = read_actor(file)
-            record = complete_record(record)
-            WRITERS[out.suffix](actor, record, out)
-        out.with_suffix(".json").write_text(json.dumps(record["policy_spec"], indent=2) + "\n", encoding="utf-8")
+        check_output(out, KINDS[out.suffix])
+        write_file(out.with_suffix(".json"), specification, json_kind(specification))
+        write_file(out, content, KINDS[out.suffix])
     except OSError as error:
-        raise PolicyError(f"{out}: cannot be written: {error.strerror}") from None
+        raise PolicyError(f"{error.filename}: cannot be written: {error.strerror}") from None
     return record["policy_spec"]
 
 
@@ -76,26 +86,35 @@ def complete_record(record: Mapping[str, Any]) -> dict[str, Any]:
     return {**record, "policy_spec": spec}
 
 
-def _write_onnx(actor: Actor, record: dict[str, Any], out: Path) -> None:
+def _onnx(actor: Actor, record: dict[str, Any]) -> bytes:
     from ce_gym.policies.onnx_writer import to_onnx
 
-    out.write_bytes(to_onnx(actor, record).SerializeToString())
+    return to_onnx(actor, record).SerializeToString()
 
 
-def _write_torchscript(actor: Actor, record: dict[str, Any], out: Path) -> None:
+def _torchscript(actor: Actor, record: dict[str, Any]) -> bytes:
     from ce_gym.policies.torchscript import to_torchscript
 
-    out.write_bytes(to_torchscript(actor, record))
+    return to_torchscript(actor, record)
 
 
-def _write_c(actor: Actor, record: dict[str, Any], out: Path) -> None:
-    out.write_text(to_c(actor, record), encoding="utf-8")
+def _npz(actor: Actor, record: dict[str, Any]) -> bytes:
+    content = io.BytesIO()
+    write_npz(actor, record, content)
+    return content.getvalue()
 
 
-WRITERS: Mapping[str, Callable[[Actor, dict[str, Any], Path], None]] = {
-    ".onnx": _write_onnx,
-    ".pt": _write_torchscript,
-    ".h": _write_c,
-    ".npz": write_npz,
+WRITERS: Mapping[str, Callable[[Actor, dict[str, Any]], bytes | str]] = {
+    ".onnx": _onnx,
+    ".pt": _torchscript,
+    ".h": to_c,
+    ".npz": _npz,
 }
-"""Writers by suffix."""
+"""Contents of the files by suffix."""
+KINDS = {
+    ".onnx": ONNX,
+    ".pt": Kind("a TorchScript policy", b"policy/"),
+    ".h": Kind("a header of a policy", b"ce_gym"),
+    ".npz": POLICY,
+}
+"""Kinds of the files by suffix."""

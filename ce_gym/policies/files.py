@@ -20,8 +20,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from ce_gym.archive import read_json, read_npz
+from ce_gym.files import POLICY, written
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
-from ce_gym.policies.archive import read_json, read_npz
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.onnx_reader import policy_of_onnx
 from ce_gym.policies.places import locate_policy
@@ -101,8 +102,13 @@ def write_npz(actor: Actor, record: Mapping[str, Any], out: Path | BinaryIO) -> 
         arrays |= {f"weight_{i}": np.float32(weight), f"bias_{i}": np.float32(bias)}
     if actor.normalisation is not None:
         arrays["normalisation"] = actor.normalisation
+    arrays = {"record": np.array(json.dumps(record)), **arrays}
     try:
-        np.savez_compressed(out, record=np.array(json.dumps(record)), **arrays)
+        if isinstance(out, Path):
+            with written(out, POLICY) as temporary, temporary.open("wb") as file:
+                np.savez_compressed(file, **arrays)
+        else:
+            np.savez_compressed(out, **arrays)
     except OSError as error:
         raise PolicyError(f"{out}: cannot be written: {error.strerror}") from None
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import filecmp
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ce_gym.files import MAP, written
 from ce_gym.policies.places import is_file
 
 
@@ -32,8 +34,9 @@ def keep_map(env_kwargs: Mapping[str, Any], folder: Path) -> None:
     """
     name = _map_of(env_kwargs)
     copy = folder / Path(name).name
-    if name and is_file(Path(name)) and not (copy.exists() and copy.samefile(name)):
-        shutil.copyfile(name, copy)
+    if name and is_file(Path(name)) and not (is_file(copy) and filecmp.cmp(name, copy, shallow=False)):
+        with written(copy, MAP) as file:
+            shutil.copyfile(name, file)
 
 
 def _map_of(env_kwargs: Mapping[str, Any]) -> str:

@@ -51,6 +51,7 @@ def complete(network: onnx.ModelProto, record: dict[str, Any], normalisation: ND
         ValueError, onnx.checker.ValidationError: If the network is damaged.
     """
     model = compose.add_prefix(network, "network/")
+    model.producer_name = "ce_gym"  # by which `ONNX` tells the file
     graph = model.graph
     weights = {constant.name for constant in graph.initializer}
     inputs = [value.name for value in graph.input if value.name not in weights]

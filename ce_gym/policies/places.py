@@ -56,6 +56,12 @@ def locate_policy(path: str | Path) -> Path:
     return file
 
 
+def policy_name(file: Path) -> str:
+    """Return the name of a policy's file, or the name of its folder for files such as `policy.npz`."""
+    folder = file.resolve().parent.name
+    return folder if file.stem == "policy" and folder else file.stem
+
+
 def is_file(path: Path) -> bool:
     """Return whether a regular file exists; False also for a path that the system refuses."""
     try:

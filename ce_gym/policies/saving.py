@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.files import ONNX, write_file
 from ce_gym.policies.actor import ACTIVATIONS, Actor
 from ce_gym.policies.arguments import RESERVED, checked_arguments
 from ce_gym.policies.errors import PolicyError
@@ -145,7 +146,7 @@ def _write_onnx(network: Any, record: dict[str, Any], normalisation: NDArray | N
     if not np.allclose(act(rows), [act(row) for row in rows], rtol=0, atol=1e-4):
         raise PolicyError(f"{path}: actions depend on earlier or other observations; expected a network without memory")
     try:
-        path.write_bytes(content)
+        write_file(path, content, ONNX)
     except OSError as error:
         raise PolicyError(f"{path}: cannot be written: {error.strerror}") from None
 

@@ -10,9 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ce_gym.console import examples, has_display
+from ce_gym.console import add_force_argument, examples, has_display, path
+from ce_gym.files import PAGE, check_output
 from ce_gym.model.mechanism import ELASTIC, LEVELS
-from ce_gym.policies import WHERE, add_env_arguments, find_policy, locate_policy
+from ce_gym.policies import WHERE, add_env_arguments, find_policy, locate_policy, policy_name
 from ce_gym.viewer.errors import ViewerError
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def add_view_command(subparsers: Any) -> None:
         ),
     )
     parser.add_argument(
-        "rollouts", nargs="+", type=Path, metavar="ROLLOUT", help=f"a recorded rollout (.npz); or a policy: {WHERE}"
+        "rollouts", nargs="+", type=path, metavar="ROLLOUT", help=f"a recorded rollout (.npz); or a policy: {WHERE}"
     )
     parser.add_argument("--overlay", action="store_true", help="draw all in one place, all but the first as ghosts")
     add_env_arguments(parser)
@@ -53,7 +54,7 @@ def add_play_command(subparsers: Any) -> None:
             "play demo --robots 16 --command 5 0.8 0 0 --command 5 0.5 0 1",
         ),
     )
-    parser.add_argument("policy", type=Path, metavar="POLICY", help=WHERE)
+    parser.add_argument("policy", type=path, metavar="POLICY", help=WHERE)
     parser.add_argument(
         "--transmission",
         nargs="+",
@@ -75,8 +76,8 @@ def add_play_command(subparsers: Any) -> None:
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first robot (default 0)")
     add_env_arguments(parser)
-    parser.add_argument("--save", type=Path, metavar="FOLDER", help="also write the rollouts as .npz files there")
-    _add_page_arguments(parser, "here, named after the policy's folder")
+    parser.add_argument("--out", type=path, metavar="FOLDER", help="also write the rollouts as .npz files there")
+    _add_page_arguments(parser, "here, named after the policy")
     parser.set_defaults(run=play)
 
 
@@ -99,7 +100,9 @@ def add_live_command(subparsers: Any) -> None:
     parser.add_argument("--transmission", metavar="LEVEL", default="", help="first level (default: as trained)")
     parser.add_argument("--ghost", metavar="LEVEL", default="", help="level of a ghost (default: no ghost)")
     parser.add_argument("--terrain", metavar="KIND", default="", help="first ground (default: as trained)")
-    parser.add_argument("--folder", type=Path, default=Path(), help="where recordings are written (default: here)")
+    parser.add_argument(
+        "--out", type=path, default=Path(), metavar="FOLDER", help="where recordings are written (default: here)"
+    )
     _add_open_argument(parser, default=True)
     parser.set_defaults(run=live)
 
@@ -118,7 +121,7 @@ def add_watch_command(subparsers: Any) -> None:
         ),
     )
     parser.add_argument(
-        "folders", nargs="+", type=Path, metavar="FOLDER", help="folder of a training run, or of several runs"
+        "folders", nargs="+", type=path, metavar="FOLDER", help="folder of a training run, or of several runs"
     )
     add_env_arguments(parser)
     _add_open_argument(parser, default=True)
@@ -137,9 +140,9 @@ def _at_least_one(text: str) -> int:
 def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     """Add the arguments for the target and the look of a page."""
     target = parser.add_mutually_exclusive_group()
-    target.add_argument("--html", type=Path, metavar="FILE", help=f"HTML file to write (default: {default})")
+    target.add_argument("--html", type=path, metavar="FILE", help=f"HTML file to write (default: {default})")
     target.add_argument("--live", action="store_true", help="serve the page on this machine's loopback until Ctrl-C")
-    target.add_argument("--video", type=Path, metavar="FILE", help="a video of one robot: FILE.mp4, .webm or .gif")
+    target.add_argument("--video", type=path, metavar="FILE", help="a video of one robot: FILE.mp4, .webm or .gif")
     parser.add_argument(
         "--size",
         type=_at_least_one,
@@ -150,6 +153,7 @@ def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     )
     parser.add_argument("--plot", nargs="+", default=[], metavar="SIGNAL", help="signals to plot first")
     parser.add_argument("--title", help="heading of the page (default: the robot's name)")
+    add_force_argument(parser)
     _add_open_argument(parser, default=False)
 
 
@@ -164,14 +168,14 @@ def view(args: argparse.Namespace) -> int:
     from ce_gym.viewer.rollouts.driving import walk
     from ce_gym.viewer.rollouts.rollout import Rollout
 
-    _check_target(args, len(args.rollouts))
-    policies = [find_policy(path) for path in args.rollouts]
+    policies = [find_policy(file) for file in args.rollouts]
+    page = args.html or (_page_of(policies[0]) if policies[0] else args.rollouts[0].with_suffix(".html"))
+    _check_target(args, page, len(args.rollouts))
     rollouts = [
-        walk(p, env=args.env, **dict(args.env_args))[0] if p else Rollout.load(path)
-        for p, path in zip(policies, args.rollouts, strict=True)
+        walk(policy, env=args.env, **dict(args.env_args))[0] if policy else Rollout.load(file)
+        for policy, file in zip(policies, args.rollouts, strict=True)
     ]
-    default = _page_of(policies[0]) if policies[0] else args.rollouts[0].with_suffix(".html")
-    return _present(rollouts, args, default, overlay=args.overlay)
+    return _present(rollouts, args, page, overlay=args.overlay)
 
 
 def play(args: argparse.Namespace) -> int:
@@ -179,7 +183,8 @@ def play(args: argparse.Namespace) -> int:
     from ce_gym.viewer.rollouts.driving import SHOW, walk
 
     file = locate_policy(args.policy)
-    _check_target(args, args.robots * max(len(args.transmission), 1))
+    page = args.html or _page_of(file)
+    _check_target(args, page, args.robots * max(len(args.transmission), 1))
     if args.robots > 1 and len(args.transmission) > 1:
         raise ViewerError(f"--robots {args.robots}: expected 1, or one level of --transmission")
     script = [(time, (x, y, turn)) for time, x, y, turn in args.command] if args.command else SHOW
@@ -188,12 +193,11 @@ def play(args: argparse.Namespace) -> int:
     rollouts = [rollout for level in levels for rollout in walk(file, script, **options, **level)]
     if args.robots > 1:
         rollouts = [replace(rollout, label=f"seed {args.seed + index}") for index, rollout in enumerate(rollouts)]
-    page = _page_of(file)
-    if args.save:
-        args.save.mkdir(parents=True, exist_ok=True)
+    if args.out:
+        args.out.mkdir(parents=True, exist_ok=True)
         for index, rollout in enumerate(rollouts):
             number = f"_{args.seed + index}" if args.robots > 1 else ""
-            print(rollout.save(args.save / f"{page.stem}_{rollout.transmission}{number}.npz"))
+            print(rollout.save(args.out / f"{policy_name(file)}_{rollout.transmission}{number}.npz"))
     return _present(rollouts, args, page, overlay=len(levels) > 1)
 
 
@@ -207,7 +211,7 @@ def live(args: argparse.Namespace) -> int:
     meshcat_code()  # a missing meshcat is reported before the compilation
     options = {name: getattr(args, name) for name in ("transmission", "ghost", "terrain")}
     setup = named(args.name, args.env or "", kwargs=dict(args.env_args), **options)
-    serve(Runner(setup, args.folder), "live", open_browser=args.open)
+    serve(Runner(setup, args.out), "live", open_browser=args.open)
     return 0
 
 
@@ -225,16 +229,19 @@ def watch(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_target(args: argparse.Namespace, robots: int) -> None:
+def _check_target(args: argparse.Namespace, page: Path, robots: int) -> None:
     """Check the requested output before the simulation.
 
     Raises:
+        OSError: The page may not be replaced.
         ViewerError: A package is missing, or a video would show several robots.
     """
     from ce_gym.viewer.page.html import meshcat_code
 
     if not args.video:
         meshcat_code()
+        if not args.live:
+            check_output(page, PAGE)
         return
     from ce_gym.viewer.video import check_video
 
@@ -244,10 +251,10 @@ def _check_target(args: argparse.Namespace, robots: int) -> None:
 
 
 def _page_of(policy: Path) -> Path:
-    return Path(f"{policy.resolve().parent.name}.html")
+    return Path(f"{policy_name(policy)}.html")
 
 
-def _present(rollouts: Sequence[Rollout], args: argparse.Namespace, default: Path, *, overlay: bool) -> int:
+def _present(rollouts: Sequence[Rollout], args: argparse.Namespace, page: Path, *, overlay: bool) -> int:
     """Write or serve the page of rollouts, or write a video; return the exit code."""
     from ce_gym.viewer import show, write_html, write_video
 
@@ -259,8 +266,7 @@ def _present(rollouts: Sequence[Rollout], args: argparse.Namespace, default: Pat
     if args.live:
         show(rollouts, open_browser=may_open, **options)
         return 0
-    path = write_html(rollouts, args.html or default, **options)
-    print(path)
+    print(write_html(rollouts, page, **options))
     if may_open:
-        webbrowser.open(path.resolve().as_uri(), new=2)
+        webbrowser.open(page.resolve().as_uri(), new=2)
     return 0

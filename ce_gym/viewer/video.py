@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.console import progress
+from ce_gym.files import VIDEOS, check_output, written
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.page.scene import load_model
 from ce_gym.viewer.raytrace.picture import Picture
@@ -58,20 +60,16 @@ def write_video(
     model = model or load_model(rollout)
     width, height = size
     picture = Picture(model, _as_on_a_plane(rollout, model), width=width, height=height, terrain=rollout.ground)
-    temporary = path.with_name(f".{path.name}")  # no partial film under the final name
     write_frames: Any = imageio_ffmpeg.write_frames
-    film = write_frames(str(temporary), size, fps=fps, macro_block_size=2, ffmpeg_log_level="error", **encoding)
-    try:
-        film.send(None)
-        for pixels in _pictures(rollout, picture, fps):
-            film.send(pixels)
-        film.close()
-        temporary.replace(path)
-    except OSError as error:
-        raise ViewerError(f"{path}: ffmpeg cannot write it ({' '.join(str(error).split())[:200]})") from None
-    finally:
-        film.close()
-        temporary.unlink(missing_ok=True)
+    options = {"fps": fps, "macro_block_size": 2, "ffmpeg_log_level": "error", **encoding}
+    with written(path, VIDEOS[path.suffix.lower()]) as temporary:
+        try:
+            with contextlib.closing(write_frames(str(temporary), size, **options)) as film:
+                film.send(None)
+                for pixels in _pictures(rollout, picture, fps):
+                    film.send(pixels)
+        except OSError as error:
+            raise ViewerError(f"{path}: ffmpeg cannot write it ({' '.join(str(error).split())[:200]})") from None
     return path
 
 
@@ -85,6 +83,7 @@ def check_video(path: Path, size: tuple[int, int]) -> None:
         raise ViewerError(f"{path}: expected a name that ends in {', '.join(KINDS)}")
     if not path.resolve().parent.is_dir():
         raise ViewerError(f"{path}: no such folder; expected an existing one")
+    check_output(path, VIDEOS[path.suffix.lower()])
     for edge in size:
         if edge % 2 or not SMALLEST <= edge <= LARGEST:
             raise ViewerError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from ce_gym.__main__ import main
 from ce_gym.identify import Identified, Log, LogError, identify, page, read_log, report, simulate_log, to_yaml
 from ce_gym.identify.base_fixed import fix_base
 from ce_gym.identify.identifiability import correlation_time
+from ce_gym.model import assets_folder
 
 pytest.importorskip("scipy")
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -150,13 +152,26 @@ def test_logs_that_do_not_fit_the_robot(leg: Robot, log: Log):
 
 
 def test_inputs_are_not_overwritten(log: Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    (tmp_path / "leg.yaml").write_text("robot: mini_cheetah\nidentified: {}\n")
+    for kind in ("yaml", "urdf"):
+        shutil.copy(assets_folder() / "mit_humanoid_leg" / f"mit_humanoid_leg.{kind}", tmp_path)
+    robot, base = tmp_path / "mit_humanoid_leg.yaml", tmp_path / "mit_humanoid_leg.urdf"
+    robot.rename(tmp_path / "leg.yaml")
+    (tmp_path / "link.yaml").hardlink_to(base)
     log.save(tmp_path / "leg.csv")
-    robot, file = str(tmp_path / "leg.yaml"), str(tmp_path / "leg.csv")
-    for words in ([robot, file], ["mini_cheetah", file, "--html", file], [robot, robot, "--simulate", "2"]):
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    robot, base, link, file = (str(tmp_path / name) for name in ("leg.yaml", base.name, "link.yaml", "leg.csv"))
+    reads, exists = "the command reads this file", "exists already"
+    for words, message in (
+        ([robot, file], reads),
+        ([robot, file, "--out", base, "--force"], reads),
+        ([robot, file, "--out", link, "--force"], reads),
+        ([robot, file, "--out", f"{base}.yaml", "--html", file, "--force"], reads),
+        ([robot, robot, "--simulate", "2", "--force"], reads),
+        ([robot, file, "--simulate", "2"], exists),
+    ):
         assert main(["identify", *words]) == 2
-        assert "would replace an input file" in capsys.readouterr().err
-    assert (tmp_path / "leg.yaml").read_text().startswith("robot: mini_cheetah")
+        assert message in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_robots_without_a_plain_yaml_file_are_refused_before_the_search(

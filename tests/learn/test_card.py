@@ -44,7 +44,7 @@ def job_of(line):
 
 @pytest.mark.slow
 def test_a_shipped_policy_is_found_by_name(run, shelf, monkeypatch, capsys):
-    assert main(["card", str(run), "--ship", "--episodes", "2", "--robots", "0", "--levels", "none"]) == 0
+    assert main(["card", str(run), "--ship", "--episodes", "2", "--sim2sim-episodes", "0", "--levels", "none"]) == 0
     folder = shelf / "mini_cheetah_velocity_exact"
     assert {file.name for file in folder.iterdir()} == {"policy.npz", "card.md", "curve.png"}
     assert ce_gym.shipped_policies() == ["mini_cheetah_velocity_exact"]

@@ -236,11 +236,15 @@ def test_an_onnx_file_is_exported_as_it_is(tmp_path):
 def test_mistakes_are_one_line(tmp_path, capsys):
     path = saved(tmp_path / "policy.npz")
     (tmp_path / "not.onnx").write_bytes(b"not onnx")
+    (tmp_path / "record.json").write_text('{"env": "ce_gym/MiniCheetahStand-v0"}')
     sb3.PPO("MlpPolicy", make_sb3_vec_env(ID, 1), device="cpu").save(tmp_path / "walk.zip")
     capsys.readouterr()
     cases = [
         (["export", tmp_path / "missing.zip"], "missing.zip: no such policy"),
-        (["export", path, "--out", path.with_suffix(".onnx")], "not the policy's own"),
+        (
+            ["export", path, "--out", tmp_path / "record.onnx"],
+            "record.json: cannot be written: exists already and is not",
+        ),
         (["export", path, "--out", tmp_path / "nowhere" / "out.onnx"], "cannot be written"),
         (
             ["export", path, "--out", tmp_path / "out.tflite"],

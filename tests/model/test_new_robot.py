@@ -97,10 +97,14 @@ def test_a_warning_is_printed_once(capsys):
     assert capsys.readouterr().err == "ce_gym: warning: the same\nce_gym: warning: another\n"
 
 
-def test_what_it_refuses(pup, tmp_path):
-    write_new_robot(pup)
-    with pytest.raises(RobotError, match=r"pup\.yaml: exists already"):
-        write_new_robot(pup)
+def test_what_it_refuses(pup, tmp_path, capsys):
+    for argv, message in (
+        ([str(pup)], "pup.yaml: exists already; expected another name, or --force"),
+        ([str(pup), "--out", str(pup), "--force"], "pup.urdf: the command reads this file"),
+    ):
+        pup.with_suffix(".yaml").touch()
+        assert main(["new", *argv]) == 2
+        assert message in capsys.readouterr().err
     with pytest.raises(RobotError, match=r"file type '\.yaml': expected a file that ends in \.urdf or \.xml"):
         write_new_robot(pup.with_suffix(".yaml"), tmp_path / "x.yaml")
 

@@ -50,7 +50,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("view nobody.npz", "nobody"),
         ("view damaged", "damaged"),
         ("view stand.npz --plot forward temperature", "no signal 'temperature' to plot; expected one of forward speed"),
-        ("view stand.npz --html no/x.html", "No such file or directory"),
+        ("view stand.npz --html no/x.html", "no such folder"),
         ("view", "ROLLOUT"),
         ("vieuw", "'vieuw'"),
         ("list --all", "--all"),

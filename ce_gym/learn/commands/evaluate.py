@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from ce_gym.console import EPISODES, WEIGHTS_SEED, above_zero, add_command, add_json_argument, print_result, whole
+from ce_gym.console import (
+    EPISODES,
+    WEIGHTS_SEED,
+    above_zero,
+    add_command,
+    add_force_argument,
+    add_json_argument,
+    add_threads_argument,
+    check_json,
+    path,
+    print_result,
+    whole,
+)
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.policies import WHERE, add_env_arguments
@@ -43,12 +54,17 @@ def evaluate(args: argparse.Namespace) -> int:
     """Evaluate, and print the results."""
     from ce_gym.learn.evaluation.crossing import cross
     from ce_gym.learn.evaluation.effort import effort
+    from ce_gym.learn.evaluation.episodes import command_ranges
     from ce_gym.learn.evaluation.evaluation import evaluate as evaluate_policy
     from ce_gym.learn.evaluation.evaluation import load, report
     from ce_gym.learn.evaluation.pushes import push_envelope
     from ce_gym.learn.evaluation.suites import evaluate_suites
 
-    policy = load(args.policy, args.env, args.transmission, args.env_args)
+    check_json(args.json)
+    policy = load(args.policy, args.env, args.transmission, args.env_args, args.threads)
+    for section in ("suites", "crossing", "pushes"):
+        if getattr(args, section):
+            command_ranges(policy, f"--{section}")
     kwargs = policy.record["env_kwargs"]
     result = evaluate_policy(policy, policy.record["env"], episodes=args.episodes, seed=args.seed, **kwargs)
     seed = result["seed"]
@@ -77,7 +93,7 @@ def add_transfer_command(subparsers: Any) -> None:
     text = f"{WHERE}; or a folder with several runs, such as `train` makes with --seeds"
     parser.add_argument("policies", nargs="+", metavar="POLICY", help=text)
     _add_common(parser, episodes=256)
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="write transfer.json, .md and .png there")
+    parser.add_argument("--out", type=path, metavar="FOLDER", help="write transfer.json, .md and .png there")
 
 
 @in_one_line
@@ -86,8 +102,9 @@ def transfer(args: argparse.Namespace) -> int:
     from ce_gym.learn.evaluation.transfer import evaluate_policies, table, write_report
     from ce_gym.learn.study import policies_in
 
-    policies = [policy for path in args.policies for policy in policies_in(path)]
-    result = evaluate_policies(policies, args.episodes, args.seed, args.env, args.env_args)
+    check_json(args.json)
+    policies = [policy for place in args.policies for policy in policies_in(place)]
+    result = evaluate_policies(policies, args.episodes, args.seed, args.env, args.env_args, args.threads)
     files = write_report(result, args.out) if args.out else []
     print_result(result, "\n".join([table(result["summary"]), *map(str, files)]), args.json)
     return 0
@@ -117,7 +134,8 @@ def sim2sim(args: argparse.Namespace) -> int:
     from ce_gym.learn.evaluation.evaluation import load
     from ce_gym.learn.evaluation.sim2sim import compare, comparison_table
 
-    policy = load(args.policy, args.env, env_args=args.env_args)
+    check_json(args.json)
+    policy = load(args.policy, args.env, env_args=args.env_args, threads=args.threads)
     result = compare(policy, episodes=args.episodes, seconds=args.seconds, every=args.every, seed=args.seed)
     print_result(result, comparison_table(result), args.json)
     return 0 if result["passed"] else 1
@@ -135,17 +153,17 @@ def add_card_command(subparsers: Any) -> None:
     )
     parser.add_argument("policy", metavar="RUN", help="folder of a training run, or the policy in it")
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--out", type=Path, metavar="FOLDER", help="default: the folder of the run")
+    where.add_argument("--out", type=path, metavar="FOLDER", help="default: the folder of the run")
     where.add_argument("--ship", action="store_true", help="write to assets/policies/<robot>_<task>_<level>")
     parser.add_argument("--task", metavar="NAME", help="in the policy's name, such as stairs (default: the task's)")
     _add_episodes_argument(parser, 2048)
     parser.add_argument(
-        "--robots", type=whole(0, 100_000), default=50, metavar="N", help="in MuJoCo; 0 skips MuJoCo (default 50)"
+        "--sim2sim-episodes", type=whole(0, 100_000), default=50, metavar="N", help="in MuJoCo; 0: none (default 50)"
     )
     text = "levels of the evaluation, in addition to the training level (default: all)"
     parser.add_argument("--levels", nargs="*", choices=LEVELS, default=LEVELS, metavar="LEVEL", help=text)
-    add_env_arguments(parser)
-    add_json_argument(parser)
+    _add_environment(parser)
+    _add_output(parser)
 
 
 @in_one_line
@@ -153,8 +171,18 @@ def card(args: argparse.Namespace) -> int:
     """Evaluate, and write the files of a card."""
     from ce_gym.learn.evaluation.card import write_card
 
+    check_json(args.json)
     file, result = write_card(
-        args.policy, args.out, args.ship, args.task, args.episodes, args.robots, args.levels, args.env, args.env_args
+        args.policy,
+        args.out,
+        args.ship,
+        args.task,
+        args.episodes,
+        args.sim2sim_episodes,
+        args.levels,
+        args.env,
+        args.env_args,
+        args.threads,
     )
     print_result(result, str(file), args.json)
     return 0
@@ -162,11 +190,21 @@ def card(args: argparse.Namespace) -> int:
 
 def _add_common(parser: argparse.ArgumentParser, episodes: int) -> None:
     """Add the arguments of evaluations: environment, number of episodes, seed, output as JSON."""
-    add_env_arguments(parser)
+    _add_environment(parser)
     _add_episodes_argument(parser, episodes)
     text = "seed of the first episode (default: the first 32 bits of the SHA-256 of the policy's weights)"
     parser.add_argument("--seed", type=WEIGHTS_SEED, metavar="N", help=text)
+    _add_output(parser)
+
+
+def _add_environment(parser: argparse.ArgumentParser) -> None:
+    add_env_arguments(parser)
+    add_threads_argument(parser)
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
     add_json_argument(parser)
+    add_force_argument(parser)
 
 
 def _add_episodes_argument(parser: argparse.ArgumentParser, episodes: int) -> None:

@@ -6,9 +6,16 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ce_gym.console import add_command
+from ce_gym.console import add_command, add_force_argument, path
 from ce_gym.learn.commands.errors import in_one_line
-from ce_gym.policies import WHERE, PolicyError, export_policy, locate_policy, observation_in_words, shelf
+from ce_gym.policies import (
+    WHERE,
+    add_env_arguments,
+    export_policy,
+    locate_policy,
+    observation_in_words,
+    shelf,
+)
 
 
 def add_export_command(subparsers: Any) -> None:
@@ -26,7 +33,9 @@ def add_export_command(subparsers: Any) -> None:
     text = (
         "files, with the suffix of their format (default: exported.onnx beside the policy; <name>.onnx here if shipped)"
     )
-    parser.add_argument("--out", type=Path, nargs="+", metavar="FILE", help=text)
+    parser.add_argument("--out", type=path, nargs="+", metavar="FILE", help=text)
+    add_env_arguments(parser)
+    add_force_argument(parser)
 
 
 @in_one_line
@@ -36,9 +45,7 @@ def export(args: argparse.Namespace) -> int:
     shipped = policy.is_relative_to(shelf())
     outs = args.out or [Path(f"{args.policy}.onnx") if shipped else policy.with_name("exported.onnx")]
     for out in outs:
-        if out.with_suffix(".json") == policy.with_suffix(".json"):
-            raise PolicyError(f"{out}: expected a name that is not the policy's own")
-        spec = export_policy(policy, out)
+        spec = export_policy(policy, out, args.env, dict(args.env_args))
         print(f"{out}\n{out.with_suffix('.json')}")
         if out is outs[-1] and "observation" in spec:
             print("Observation:", *observation_in_words(spec), sep="\n")

@@ -11,6 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ce_gym.files import CARD, PICTURE, check_output, write_file
 from ce_gym.learn.evaluation.crossing import cross
 from ce_gym.learn.evaluation.effort import effort
 from ce_gym.learn.evaluation.episodes import weights_seed
@@ -33,13 +34,15 @@ OF_TRAINING = ("resumed_from", "seed", "settings", "steps", "training_seconds", 
 """Keys of a record that a card needs, and that training alone writes."""
 
 
-def card_results(policy: Policy, episodes: int, sim2sim_robots: int, levels: Sequence[str] = LEVELS) -> dict[str, Any]:
+def card_results(
+    policy: Policy, episodes: int, sim2sim_episodes: int, levels: Sequence[str] = LEVELS
+) -> dict[str, Any]:
     """Return all results for the card of a policy.
 
     Args:
         policy: Policy with its record.
         episodes: Episodes at each level, and of each suite.
-        sim2sim_robots: Number of robots in MuJoCo; 0 skips MuJoCo.
+        sim2sim_episodes: Episodes in MuJoCo; 0 skips MuJoCo.
         levels: Levels of the evaluation, in addition to the training level.
 
     Returns:
@@ -72,10 +75,10 @@ def card_results(policy: Policy, episodes: int, sim2sim_robots: int, levels: Seq
     result["pushes"] = push_envelope(policy, seed=seed, **kwargs)
     if "levels" in by_level[trained]:
         result["crossing"] = cross(policy, **common, **kwargs)
-    if not sim2sim_robots:
+    if not sim2sim_episodes:
         return result | {"sim2sim_missing": "not requested"}
     try:
-        return result | {"sim2sim": compare(policy, episodes=sim2sim_robots, seed=seed)}
+        return result | {"sim2sim": compare(policy, episodes=sim2sim_episodes, seed=seed)}
     except ImportError:
         return result | {"sim2sim_missing": "MuJoCo is not installed: pip install ce_gym[mjcf]"}
     except ValueError as error:  # MuJoCo cannot express every robot
@@ -206,33 +209,40 @@ def write_card(
     ship: bool,
     task: str | None,
     episodes: int,
-    robots: int,
+    sim2sim_episodes: int,
     levels: Sequence[str],
     env: str | None,
     env_args: Iterable[tuple[str, Any]],
+    threads: int | None = None,
 ) -> tuple[Path, dict[str, Any]]:
     """Evaluate a policy, write `card.md`, `curve.png` and `policy.npz`, and return the card's path and the results.
 
     The files are written to `out`, to the folder of shipped policies if `ship` is true, and to the folder of the policy
-    otherwise. For `task`, see `short_name`; for `episodes`, `robots` and `levels`, `card_results`; for `env` and
-    `env_args`, `evaluation.load`.
+    otherwise, where an existing `policy.npz` stays as it is. For `task`, see `short_name`; for `episodes`, `sim2sim_episodes` and `levels`, `card_results`; for `env`,
+    `env_args` and `threads`, `evaluation.load`.
 
     Raises:
         PolicyError: If the policy cannot be used.
     """
     source = locate_policy(run)
     actor, record = read_actor(source)
-    evaluated = load(source, env, env_args=env_args)
+    evaluated = load(source, env, env_args=env_args, threads=threads)
     if missing := [key for key in OF_TRAINING if key not in record]:
         raise PolicyError(f"{source}: {missing[0]}: missing; expected a policy that `python -m ce_gym train` wrote")
     record, curve = portable(record), read_curve(source.parent / LOG)
     name = short_name(record, task)
     folder = shelf() / name if ship else out or source.parent
-    result = card_results(Policy(actor, evaluated.record), episodes, robots, levels)
+    if folder.resolve().is_relative_to(shelf().resolve()) and not ship:
+        raise PolicyError(f"{run}: is a policy of the package; expected --out FOLDER")
+    policy = folder / "policy.npz"
+    for file, kind in ((folder / "card.md", CARD), (folder / "curve.png", PICTURE)):
+        check_output(file, kind)
+    result = card_results(Policy(actor, evaluated.record), episodes, sim2sim_episodes, levels)
     folder.mkdir(parents=True, exist_ok=True)
-    write_npz(actor, record, folder / "policy.npz")
+    if policy.resolve() != source.resolve():
+        write_npz(actor, record, policy)
     keep_map(evaluated.record["env_kwargs"], folder)
     if curve:
         draw_curve(curve, name, folder / "curve.png")
-    (folder / "card.md").write_text(card(record, result, curve, name), encoding="utf-8")
+    write_file(folder / "card.md", card(record, result, curve, name), CARD)
     return folder / "card.md", result

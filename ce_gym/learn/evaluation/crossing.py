@@ -13,8 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.learn.evaluation.episodes import UNDISTURBED, open_environments, run_policy, without_curricula
-from ce_gym.policies import Policy, PolicyError
+from ce_gym.learn.evaluation.episodes import (
+    UNDISTURBED,
+    command_ranges,
+    open_environments,
+    run_policy,
+    without_curricula,
+)
+from ce_gym.policies import Policy
 
 Array = NDArray[np.float64]
 
@@ -51,8 +57,7 @@ def cross(
         PolicyError: If the task of the policy has no commands.
     """
     env_id, spec = policy.record["env"], policy.record["policy_spec"]
-    if "command" not in spec:
-        raise PolicyError(f"crossing: {env_id} has no commanded velocities; expected a task with them")
+    command_ranges(policy, "crossing")
     steps = math.ceil(PATIENCE * distance / speed / spec["control_dt"])
     arguments = without_curricula(env_id, kwargs) | UNDISTURBED | {"max_episode_steps": steps + 1}
     with open_environments(env_id, episodes, seed, **arguments) as (envs, obs):

@@ -17,7 +17,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from ce_gym.console import progress
-from ce_gym.policies import Actor, registered
+from ce_gym.policies import Actor, Policy, PolicyError, registered
 
 Array = NDArray[np.float64]
 
@@ -54,6 +54,18 @@ def weights_seed(policy: Any) -> int:
         for array in layer:
             digest.update(np.ascontiguousarray(array, "<f4").tobytes())
     return int.from_bytes(digest.digest()[:4], "big")
+
+
+def command_ranges(policy: Policy, what: str) -> Array:
+    """Return the bounds of the commands of a policy's task, shape (3, 2) [m/s, m/s, rad/s].
+
+    Raises:
+        PolicyError: If the task has no commands; the message begins with `what`.
+    """
+    ranges = policy.record["policy_spec"].get("command", {}).get("range")
+    if ranges is None:
+        raise PolicyError(f"{what}: {policy.record['env']} has no commanded velocities; expected a task with them")
+    return np.array(ranges)
 
 
 def without_curricula(env_id: str, kwargs: Mapping[str, Any]) -> dict[str, Any]:

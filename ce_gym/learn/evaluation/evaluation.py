@@ -20,6 +20,7 @@ def load(
     env: str | None = None,
     transmission: str | None = None,
     env_args: Iterable[tuple[str, Any]] = (),
+    threads: int | None = None,
 ) -> Policy:
     """Return a policy whose record has the environment of the evaluation.
 
@@ -28,14 +29,16 @@ def load(
         env: Environment id from the command line; None keeps the id of the record.
         transmission: Transmission level of the environment; None keeps the level in the record.
         env_args: Arguments of the environment that replace arguments in the record.
+        threads: Processor threads of the environment; None keeps its default.
 
     Raises:
         PolicyError: If the policy cannot be used, or its environment needs `--env`: see
             `ce_gym.policies.environment_of`.
     """
     policy = load_policy(path, transmission, env, dict(env_args))
-    level = {"transmission": transmission} if transmission else {}
-    kwargs = {**policy.record["env_kwargs"], **dict(env_args), **level}
+    given = {"transmission": transmission, "num_threads": threads}
+    options = {name: value for name, value in given.items() if value}
+    kwargs = {**policy.record["env_kwargs"], **dict(env_args), **options}
     return replace(policy, record=policy.record | {"env": environment_of(policy.record, env), "env_kwargs": kwargs})
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ce_gym.files import PICTURE, written
+
 INK, MUTED, LINE = "#22262b", "#6b7280", "#2a6f97"
 
 
@@ -55,7 +57,8 @@ def draw_transfer(result: dict[str, Any], file: Path) -> None:
     over = "one seed" if seeds == 1 else f"mean of {seeds} seeds ± 95 % confidence"
     heading = f"{result['env']}: {over}, {result['episodes']} episodes each; bold: level of training"
     figure.suptitle(heading, fontsize=10)
-    figure.savefig(file, dpi=130)
+    with written(file, PICTURE) as temporary:
+        figure.savefig(temporary, dpi=130)
 
 
 def draw_curve(rows: list[dict[str, float]], title: str, file: Path) -> None:
@@ -77,4 +80,5 @@ def draw_curve(rows: list[dict[str, float]], title: str, file: Path) -> None:
         ax.grid(color="#e5e7eb", linewidth=0.8)
         ax.spines[["top", "right"]].set_visible(False)
     figure.suptitle(title, fontsize=10)
-    figure.savefig(file, dpi=80)
+    with written(file, PICTURE) as temporary:
+        figure.savefig(temporary, dpi=80)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ce_gym.learn.evaluation.episodes import UNDISTURBED, open_environments, play, without_curricula
-from ce_gym.policies import Policy, PolicyError
+from ce_gym.learn.evaluation.episodes import UNDISTURBED, command_ranges, open_environments, play, without_curricula
+from ce_gym.policies import Policy
 
 SETTLE = 1.0
 """Time before the first push [s]."""
@@ -60,15 +60,12 @@ def evaluate_suites(policy: Policy, episodes: int, seed: int, **kwargs: Any) -> 
     Raises:
         PolicyError: If the task of the policy has no commands.
     """
-    env_id = policy.record["env"]
-    ranges = policy.record["policy_spec"].get("command", {}).get("range")
-    if ranges is None:
-        raise PolicyError(f"suites: {env_id} has no commanded velocities; expected a task with them")
+    env_id, ranges = policy.record["env"], command_ranges(policy, "suites")
     arguments = without_curricula(env_id, kwargs) | UNDISTURBED
     result = {}
     for name, suite in SUITES.items():
         with open_environments(env_id, episodes, seed, **arguments) as (envs, obs):
-            drive = driver(suite, envs.unwrapped, np.array(ranges), seed)
+            drive = driver(suite, envs.unwrapped, ranges, seed)
             result[name] = play(policy, envs, obs, drive, name)
     return result
 

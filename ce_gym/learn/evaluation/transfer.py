@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ce_gym.console import Table, markdown
+from ce_gym.files import CARD, json_kind, write_file
 from ce_gym.learn.evaluation.episodes import ERRORS, Predicts
 from ce_gym.learn.evaluation.evaluation import evaluate, load
 from ce_gym.learn.evaluation.pictures import draw_transfer
@@ -106,6 +107,7 @@ def evaluate_policies(
     seed: int | None,
     env: str | None = None,
     env_args: Iterable[tuple[str, Any]] = (),
+    threads: int | None = None,
 ) -> dict[str, Any]:
     """Evaluate policies of one task at every level; see `evaluate.load` for the arguments.
 
@@ -115,7 +117,7 @@ def evaluate_policies(
     Raises:
         PolicyError: If the policies are for different robots or tasks.
     """
-    models = {str(path): load(path, env, env_args=env_args) for path in policies}
+    models = {str(path): load(path, env, env_args=env_args, threads=threads) for path in policies}
     levels = (*LEVELS, *(model.record["transmission"] for model in models.values()))
     evaluations, tasks = [], set()
     for path, model in models.items():
@@ -137,9 +139,10 @@ def write_report(result: dict[str, Any], folder: Path) -> list[Path]:
     """Write `transfer.json`, `transfer.md` and the picture `transfer.png` into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"transfer.{kind}" for kind in ("json", "md", "png")]
-    files[0].write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    text = json.dumps(result, indent=2) + "\n"
+    write_file(files[0], text, json_kind(text))
     heading = f"# Transfer between transmission levels: {result['env']}\n\n![Errors and falls](transfer.png)\n\n"
     note = f"\n\n{result['episodes']} episodes for each policy and level.\n"
-    files[1].write_text(heading + table(result["summary"]) + note, encoding="utf-8")
+    write_file(files[1], heading + table(result["summary"]) + note, CARD)
     draw_transfer(result, files[2])
     return files

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ce_gym.files import PAGE, write_file
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.page import arrows, three
 from ce_gym.viewer.page.charts import charts, default_plots, packed
@@ -82,7 +83,7 @@ def write_html(rollouts: Rollout | Sequence[Rollout], path: str | Path, **option
     """
     path = Path(path)
     text = page(rollouts, **options)
-    path.write_text(text, encoding="utf-8")
+    write_file(path, text, PAGE)
     if len(text) > LARGE:
         advice = "fewer seconds, robots or frames (max_fps) make it smaller"
         warnings.warn(f"{path}: the page has {len(text) / 1e6:.1f} MB; {advice}", stacklevel=2)

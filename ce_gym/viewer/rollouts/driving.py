@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ce_gym.envs.base import BaseEnv
-from ce_gym.policies import environment_of, import_module_of, load_policy
+from ce_gym.policies import environment_of, import_module_of, load_policy, policy_name
 from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.rollouts.recording import Act, record_lanes
 from ce_gym.viewer.rollouts.rollout import Rollout
@@ -98,5 +98,5 @@ def walk(file: Path, script: Script = SHOW, *, env: str | None = None, **options
     policy = load_policy(file, env=env, env_kwargs=arguments)
     record = policy.record
     env_id = environment_of(record, env)
-    kwargs: Mapping[str, Any] = {"robots": 1, "label": file.resolve().parent.name, **record["env_kwargs"], **options}
+    kwargs: Mapping[str, Any] = {"robots": 1, "label": policy_name(file), **record["env_kwargs"], **options}
     return drive_many(lambda observation: policy.predict(observation)[0], env_id, script, **kwargs)

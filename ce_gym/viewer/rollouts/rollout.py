@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.policies.archive import read_npz
+from ce_gym.archive import read_npz
+from ce_gym.files import ROLLOUT, written
 from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.rollouts.ground_patch import Heights
 
@@ -146,7 +147,7 @@ class Rollout:
             header["ground"] = {"cell": self.ground.cell, "origin": self.ground.origin, "low": low, "step": step}
         path = Path(path)
         # numpy would append .npz to a name without.
-        with path.open("wb") as file:
+        with written(path, ROLLOUT) as temporary, temporary.open("wb") as file:
             np.savez_compressed(
                 file,
                 header=np.array(json.dumps(header)),
