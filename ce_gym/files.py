@@ -148,7 +148,7 @@ def _is_of(path: Path, kind: Kind) -> bool:
 
 
 @contextlib.contextmanager
-def written(path: str | Path, kind: Kind) -> Iterator[Path]:
+def written(path: str | os.PathLike[str], kind: Kind) -> Iterator[Path]:
     """Context that gives the name of a temporary file beside a path, and renames the file at the end.
 
     A device or a pipe is written directly.
@@ -175,7 +175,7 @@ def written(path: str | Path, kind: Kind) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_file(path: str | Path, content: bytes | str, kind: Kind) -> None:
+def write_file(path: str | os.PathLike[str], content: bytes | str, kind: Kind) -> None:
     """Write a file as a whole; see `written`."""
     with written(path, kind) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -188,6 +188,6 @@ def write_whole(files: Mapping[Path, bytes]) -> None:
         OSError: A file cannot be written; see `check_output`.
     """
     with contextlib.ExitStack() as stack:
-        for file, content in reversed(files.items()):  # the stack renames in the opposite order
+        for file, content in reversed(list(files.items())):  # the stack renames in the opposite order
             file.parent.mkdir(parents=True, exist_ok=True)
             stack.enter_context(written(file, ANY)).write_bytes(content)

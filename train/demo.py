@@ -1,6 +1,6 @@
 """Train a robot, evaluate it, and show it in a browser, in one command.
 
-A second call uses the finished policy, or continues an interrupted training; `--fresh` starts again.
+A second call uses the finished policy, or continues an interrupted training; `--force` starts again.
 
     python train/demo.py
 """
@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from ce_gym.__main__ import run
-from ce_gym.console import EPISODES, SEED, STEPS, Parser, above_zero, add_threads_argument
+from ce_gym.console import EPISODES, SEED, STEPS, Parser, above_zero, add_threads_argument, path
+from ce_gym.files import set_force
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.learn.evaluation.episodes import EVALUATION_SEED
 from ce_gym.learn.evaluation.evaluation import report
@@ -30,20 +31,21 @@ ENV = "ce_gym/MiniCheetahVelocity-v0"
 
 def obtain_policy(args: argparse.Namespace) -> Path:
     """Return the policy in the output folder, trained now if necessary, and print which."""
+    set_force(args.force)
     job = make_job(
         args.env, out=args.out, seed=args.seed, settings={"steps": args.steps} if args.steps else {},
-        env_kwargs=dict(args.env_args), threads=args.threads, seconds=60.0 * args.minutes,
+        env_kwargs=dict(args.env_args), threads=args.threads, seconds=args.seconds,
     )  # fmt: skip
     policy = args.out / "policy.npz"
-    if policy.exists() and not args.fresh:
+    if policy.exists() and not args.force:
         record = load_policy(policy).record
         same = (record["env"], record["env_kwargs"]) == (args.env, with_map(job.env_kwargs, policy))
         if record.get("finished") and same:
-            print(f"Using the policy trained earlier: {policy}, {record['steps']:,} steps. --fresh trains a new one.")
+            print(f"Using the policy trained earlier: {policy}, {record['steps']:,} steps. --force trains a new one.")
             return policy
         job = job.replace(resume=policy if same else None)
     begin = f"Continuing {policy}" if job.resume else "Training a new policy"
-    length = f"{job.settings.steps:,} steps or {args.minutes:g} minutes"
+    length = f"{job.settings.steps:,} steps or {args.seconds:g} s"
     print(f"{begin}: {args.env}, {length}. Ctrl-C stops and keeps the policy.")
     return _announce(run_job(job))
 
@@ -61,17 +63,17 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(description="Train a robot on exact transmissions, evaluate it, and show it.")
     parser.add_argument("--env", default=ENV, metavar="ID", help=f"environment id (default {ENV})")
     add_env_arg(parser)
-    parser.add_argument("--fresh", action="store_true", help="train a new policy even if an earlier run left one")
+    parser.add_argument("--force", action="store_true", help="train a new policy even if an earlier run left one")
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", type=STEPS, metavar="N", help="environment steps (default: as in the settings file)")
     parser.add_argument(
-        "--minutes", type=above_zero, default=4.0, metavar="M", help="longest training time [min] (default 4)"
+        "--seconds", type=above_zero, default=240.0, metavar="T", help="longest training time [s] (default 240)"
     )
     add_threads_argument(parser)
     parser.add_argument(
         "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation (default 256)"
     )
-    parser.add_argument("--out", type=Path, default=Path("demo"), metavar="FOLDER", help="default: demo")
+    parser.add_argument("--out", type=path, default=Path("demo"), metavar="FOLDER", help="default: demo")
     args = parser.parse_args(argv)
     return run(in_one_line(lambda: show(obtain_policy(args), args.episodes, args.out, args.env)))
 

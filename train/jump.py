@@ -22,7 +22,7 @@ from ilqr import ILQR, Array, Plan, State, select
 
 import ce_gym
 from ce_gym.__main__ import run
-from ce_gym.console import Parser, above_zero, add_json_argument, markdown, print_result
+from ce_gym.console import Parser, above_zero, add_json_argument, markdown, path, print_result
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.viewer import Rollout, write_html
 
@@ -209,7 +209,7 @@ def jump(args: argparse.Namespace) -> int:
             rollouts.append(evaluator.rollout(motions[how], f"planned on {level}, {how}"))
         standing = float(evaluator.rest["q"][0, 2])
         rows += [{"plan": level, "followed": how, **figures(one, standing)} for how, one in motions.items()]
-    page = write_html(rollouts, args.page or Path(f"{evaluator.model.robot.name}_jump.html"), spacing=0.0)
+    page = write_html(rollouts, args.html or Path(f"{evaluator.model.robot.name}_jump.html"), spacing=0.0)
     print_result({"times": times, "motions": rows, "page": str(page)}, _text(rows, times, page), args.json)
     return 0
 
@@ -235,7 +235,7 @@ def main(argv: list[str] | None = None) -> int:
         "--level", nargs="+", choices=ce_gym.LEVELS, default=list(LEVELS), metavar="LEVEL",
         help="levels of the plans; all plans are simulated at the first level (default: exact armature)",
     )  # fmt: skip
-    parser.add_argument("--page", type=Path, metavar="FILE", help="default: <robot>_jump.html")
+    parser.add_argument("--html", type=path, metavar="FILE", help="default: <robot>_jump.html")
     add_json_argument(parser)
     args = parser.parse_args(argv)
     return run(in_one_line(lambda: jump(args)))

@@ -30,17 +30,19 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from ce_gym.__main__ import run
 from ce_gym.adapters.sb3 import make_sb3_vec_env
-from ce_gym.console import Parser
+from ce_gym.console import Parser, add_force_argument
+from ce_gym.files import set_force
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.learn.evaluation.evaluation import evaluate, report
+from ce_gym.learn.runs.folder import run_folder
 from ce_gym.policies import load_policy, save
 
-# A new reward term: remove the `#`. With `ppo:` before the id, other commands import this file and find the term.
+# A new reward term: remove the `#`. Other commands import this file, by `ppo:` before the id, and find the term.
 # import ce_gym
 # @ce_gym.reward
 # def forward_speed(s):  # s: docs/reference/terms.md
 #     return s.base_linear_velocity[0]
-# python train/ppo.py --env ppo:ce_gym/MiniCheetahVelocity-v0 --rewards '{"forward_speed": 0.5}'
+# python train/ppo.py --rewards '{"forward_speed": 0.5}'
 # PYTHONPATH=train python -m ce_gym evaluate runs/ppo --env ppo:ce_gym/MiniCheetahVelocity-v0
 
 
@@ -87,7 +89,10 @@ def parse_settings(argv: list[str] | None = None) -> Settings:
         kind, name = type(default), f"--{setting.name.replace('_', '-')}"
         options = {**setting.metadata, "nargs": "+"} if kind is tuple else setting.metadata
         parser.add_argument(name, type=readers.get(kind, kind), default=default, metavar="X", **options)
-    return Settings(**vars(parser.parse_args(argv)))
+    add_force_argument(parser)
+    settings = vars(parser.parse_args(argv))
+    set_force(settings.pop("force"))
+    return Settings(**settings)
 
 
 class Report(BaseCallback):
@@ -137,12 +142,16 @@ def train(s: Settings) -> Path:
 def main(argv: list[str] | None = None) -> int:
     """Train, and evaluate the policy on exact transmissions and on armatures, their usual simplification."""
     s = parse_settings(argv)
-    path = train(s)
+    if ":" not in s.env and any(name in globals() for name in s.rewards):
+        s.env = f"ppo:{s.env}"  # so that other commands find the terms of this file
+    with run_folder(Path(s.out)):
+        path = train(s)
     policy = load_policy(path)
     for level in ("exact", "armature"):
         result = evaluate(policy, s.env, **policy.record["env_kwargs"] | {"transmission": level})
         print(f"\non {level} transmissions\n{report(result)}")
-    print(f"\npython -m ce_gym play {path}", f"--env {s.env}" if ":" in s.env else "")
+    place = "PYTHONPATH=train " if s.env.startswith("ppo:") else ""
+    print(f"\n{place}python -m ce_gym play {path}" + (f" --env {s.env}" if ":" in s.env else ""))
     return 0
 
 

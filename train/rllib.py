@@ -5,7 +5,7 @@ Needs the extra `ray` in a separate virtual environment, see docs/how-to/learner
 `python -m ce_gym train`; `num_envs` counts the environments of all processes together. The policy is written as
 `policy.npz`, which `python -m ce_gym evaluate`, `play` and the other commands read.
 
-    python train/rllib.py ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --minutes 1
+    python train/rllib.py ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --seconds 60
     python train/rllib.py ce_gym/MiniCheetahVelocity-v0 --env-runners 2 --resume
 """
 
@@ -27,11 +27,12 @@ from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
 import ce_gym  # noqa: F401  (registers the environments in this process)
 from ce_gym.__main__ import run
-from ce_gym.console import SEED, THREADS, Parser, above_zero, whole
+from ce_gym.console import SEED, THREADS, Parser, above_zero, add_force_argument, path, whole
+from ce_gym.files import set_force
 from ce_gym.learn.commands.errors import in_one_line
-from ce_gym.learn.runs.folder import make_folder
-from ce_gym.learn.runs.job import basic_record
-from ce_gym.learn.runs.settings import Settings, SettingsError
+from ce_gym.learn.runs.folder import remove, run_folder, unused_folder
+from ce_gym.learn.runs.job import Job, basic_record
+from ce_gym.learn.runs.settings import Settings, SettingsError, config_file
 from ce_gym.learn.training import make_job
 from ce_gym.policies import Actor, add_env_arg, keep_map, write_npz
 
@@ -173,10 +174,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
     parser.add_argument(
-        "--minutes", type=above_zero, default=float("inf"), metavar="M", help="longest training time [min]"
+        "--seconds", type=above_zero, default=float("inf"), metavar="T", help="longest training time [s]"
     )
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings to change")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rllib")
+    parser.add_argument("--out", type=path, metavar="FOLDER", help="default: runs/<name of the settings file>-rllib")
+    add_force_argument(parser)
     parser.add_argument("--resume", action="store_true", help="continue from the checkpoint in the folder")
     args = parser.parse_args(argv)
     return run(in_one_line(lambda: _work(args)))
@@ -184,13 +186,24 @@ def main(argv: list[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> int:
     """Train, write the policy, and print its path."""
+    set_force(args.force)
     settings = [*args.set, *([f"steps={args.steps}"] if args.steps else [])]
     level = {"transmission": args.transmission} if args.transmission else {}
     job = make_job(args.env, settings=settings, env_kwargs={**level, **dict(args.env_args)}, seed=args.seed)
-    out = args.out or job.out.with_name(f"{job.out.name}-rllib")
-    checkpoint, s = out / "checkpoint", job.settings
+    default = Path("runs") / "-".join(filter(None, (config_file(args.env).stem, args.transmission, "rllib")))
+    out = args.out or (default if args.resume else unused_folder(default))
+    checkpoint = out / "checkpoint"
     if args.resume and not checkpoint.exists():
         raise SettingsError(f"--resume: {checkpoint}: no such folder; expected the checkpoint of an earlier run")
+    with run_folder(out, checkpoint if args.resume else None) as replaced:
+        _train(args, job, out, checkpoint, replaced)
+    print(out / "policy.npz")
+    return 0
+
+
+def _train(args: argparse.Namespace, job: Job, out: Path, checkpoint: Path, replaced: list[Path]) -> None:
+    """Train, and write the policy."""
+    s = job.settings
     env = gymnasium.make_vec(args.env, num_envs=1, **job.env_kwargs)  # errors in one line; fills the kernel cache
     ray.init(address=args.address, log_to_driver=False, include_dashboard=False)
     options = {**job.env_kwargs, **s.training, "num_threads": args.threads}
@@ -199,15 +212,13 @@ def _work(args: argparse.Namespace) -> int:
         algo.restore_from_path(str(checkpoint.resolve()))
     else:
         set_initial_std(algo, s.initial_std)
-    make_folder(out)
+    remove(replaced)
     keep_map(job.env_kwargs, out)
-    steps = train(algo, s.steps, 60.0 * args.minutes, checkpoint)
+    steps = train(algo, s.steps, args.seconds, checkpoint)
     algo.save_to_path(str(checkpoint.resolve()))
     record = basic_record(env.unwrapped, args.env, job.env_kwargs, s) | {"steps": steps}
     write_npz(actor_of(algo, s.activation), record, out / "policy.npz")
     algo.stop()
-    print(out / "policy.npz")
-    return 0
 
 
 if __name__ == "__main__":

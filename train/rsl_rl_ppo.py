@@ -24,10 +24,11 @@ from rsl_rl.runners import OnPolicyRunner
 
 from ce_gym.__main__ import run
 from ce_gym.adapters.rsl_rl import make_rsl_rl_vec_env
-from ce_gym.console import EPISODES, SEED, Parser
+from ce_gym.console import EPISODES, SEED, Parser, add_force_argument, path
+from ce_gym.files import set_force
 from ce_gym.learn.commands.errors import in_one_line
 from ce_gym.learn.evaluation.evaluation import evaluate, report
-from ce_gym.learn.runs.folder import make_folder
+from ce_gym.learn.runs.folder import remove, run_folder, unused_folder
 from ce_gym.learn.runs.job import Job, Trained, acting_environment, make_record
 from ce_gym.learn.runs.progress import StopInOrder
 from ce_gym.learn.runs.settings import Settings, config_file
@@ -94,13 +95,18 @@ def restore(runner: OnPolicyRunner, folder: Path) -> None:
 
 
 def train(job: Job, device: str = "cpu") -> Trained:
-    """Train, and save the policy even if Ctrl-C or SIGTERM ends training early; the iteration is finished first.
+    """Train, and save the policy even if a signal ends training early; the iteration is finished first.
 
     Raises:
+        OSError: If the folder has another run or another owner, or cannot be written.
         PolicyError: If the run to resume does not fit the environment or the settings.
     """
+    with run_folder(job.out, job.resume) as replaced:
+        return _train(job, device, replaced)
+
+
+def _train(job: Job, device: str, replaced: list[Path]) -> Trained:
     s, file = job.settings, job.out / "policy.npz"
-    make_folder(job.out)
     keep_map(job.env_kwargs, job.out)
     torch.manual_seed(job.seed)
     envs = make_rsl_rl_vec_env(job.env_id, s.num_envs, job.seed, device, **{**job.env_kwargs, **s.training})
@@ -121,11 +127,13 @@ def train(job: Job, device: str = "cpu") -> Trained:
         if stop.due:
             raise KeyboardInterrupt
 
+    remove(replaced)
     done = runner.current_learning_iteration
     trained = save(done, done >= iterations(s))  # with the settings, which a killed run needs to continue
     if done < iterations(s):
         runner.logger.log = log_and_stop  # type: ignore[method-assign]
         with StopInOrder() as stop, contextlib.suppress(KeyboardInterrupt):
+            stop.has_progress = True  # the policy is saved already
             runner.learn(iterations(s) - done, init_at_random_ep_len=True)
         done = runner.current_learning_iteration + 1
         runner.save(str(job.out / f"model_{done - 1}.pt"))
@@ -148,12 +156,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--transmission", metavar="LEVEL", help="exact, coupled, armature, none or elastic")
     parser.add_argument("--critic", nargs="+", metavar="BLOCK", help="observation blocks that only the critic sees")
     add_env_arg(parser)
-    parser.add_argument("--resume", type=Path, metavar="FOLDER", help="run to continue; --steps includes its steps")
+    parser.add_argument("--resume", type=path, metavar="FOLDER", help="run to continue; --steps includes its steps")
     parser.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     parser.add_argument("--steps", metavar="N", help="environment steps in all, such as 6e6")
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="settings to change")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda for networks and physics on a GPU (default cpu)")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>-rsl_rl")
+    parser.add_argument("--out", type=path, metavar="FOLDER", help="default: runs/<name of the settings file>-rsl_rl")
+    add_force_argument(parser)
     parser.add_argument(
         "--episodes", type=EPISODES, default=256, metavar="N", help="episodes of the evaluation at the end"
     )
@@ -163,10 +172,12 @@ def main(argv: list[str] | None = None) -> int:
 
 def _work(args: argparse.Namespace) -> int:
     """Train, write and evaluate the policy, and print its path."""
+    set_force(args.force)
     kwargs: dict[str, Any] = {"dtype": "float32"} if args.device.startswith("cuda") else {}
     kwargs |= {"transmission": args.transmission} if args.transmission else {}
     kwargs |= {"obs_mode": "dict", "critic": args.critic} if args.critic else {}
-    folder = locate_policy(args.resume).parent if args.resume else Path("runs") / f"{config_file(args.env).stem}-rsl_rl"
+    default = Path("runs") / f"{config_file(args.env).stem}-rsl_rl"
+    folder = locate_policy(args.resume).parent if args.resume else unused_folder(default)
     job = make_job(
         args.env,
         "ppo",

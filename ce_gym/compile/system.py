@@ -1,4 +1,4 @@
-"""Differences of operating systems: users, usable cores, names of CPUs, forks.
+"""Differences of operating systems: users, usable cores, names of CPUs, forks, locks of files.
 
 Only this file calls functions that some system lacks.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import platform
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,6 +23,23 @@ def user_number() -> int | None:
     """Return the effective user number of this process; None where users have no numbers, as on Windows."""
     number = getattr(os, "geteuid", None)
     return number() if number else None
+
+
+def lock(descriptor: int) -> None:
+    """Lock an open file for this process; the system frees the lock when the process ends.
+
+    Raises:
+        OSError: Another process has the lock, or the file system has no locks.
+    """
+    if sys.platform == "win32":
+        import msvcrt
+
+        os.lseek(descriptor, 2**20, os.SEEK_SET)  # others cannot read the locked byte
+        msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def usable_cores() -> int:

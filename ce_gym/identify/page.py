@@ -40,7 +40,8 @@ def page(result: Identified, shown: int = 4) -> str:
         for color, name in ((MEASURED, "measured"), (BEFORE, "errors before"), (AFTER, "errors as identified"))
     )
     return (
-        '<!doctype html>\n<!-- ce_gym: measured and simulated curves -->\n<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        "<!doctype html>\n<!-- ce_gym: measured and simulated curves -->\n"
+        '<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
         f"<title>{title}</title><style>{STYLE}</style><h1>{title}</h1>"
         f"<table>{_row('th', COLUMNS)}{table}</table>{lines}"
         f"<p>Windows that were not fitted, each from its own initial state: {keys}, simulated minus measured.</p>"

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ce_gym.files import is_forced
 from ce_gym.learn.runs.job import Job
 from ce_gym.learn.training import make_job
 from ce_gym.policies import PolicyError, find_policy, load_policy, locate_policy
@@ -36,6 +37,7 @@ def study_jobs(
     """
     kwargs = dict(env_kwargs or {})
     of_level = [kwargs | {"transmission": level} for level in levels] or [kwargs]
+    options["several"] = len(levels) > 1 or len(seeds) > 1
     folder = make_job(env_id, algo, env_kwargs=of_level[0] if len(levels) < 2 else kwargs, **options).out
     jobs = []
     for arguments, seed in itertools.product(of_level, seeds):
@@ -49,11 +51,13 @@ def study_jobs(
 def unfinished(job: Job) -> Job | None:
     """Return a run that continues the policy in its folder if there is one, or None if that is finished.
 
+    With `--force` all runs start again.
+
     Raises:
         PolicyError: If the policy was trained with another environment, seed or settings.
     """
     policy = find_policy(job.out)
-    if policy is None:
+    if policy is None or is_forced():
         return job
     record = load_policy(policy).record
     trained = {"env": record["env"], "seed": record["seed"], **record["env_kwargs"], **record["settings"]}
@@ -62,7 +66,7 @@ def unfinished(job: Job) -> Job | None:
     for key in {**requested, **trained}:
         if trained.get(key, ...) != requested.get(key, ...):
             both = f"trained with {key} = {trained.get(key)!r}, requested {requested.get(key)!r}"
-            raise PolicyError(f"{policy}: {both}; give another --out folder")
+            raise PolicyError(f"{policy}: {both}; give another --out folder, or --force")
     return None if record["finished"] else job.replace(resume=policy)
 
 

@@ -9,10 +9,10 @@ from types import ModuleType
 from typing import Any
 
 from ce_gym.compile.system import usable_cores
-from ce_gym.learn.runs.folder import make_folder
+from ce_gym.learn.runs.folder import run_of, unused_folder
 from ce_gym.learn.runs.job import Job, Trained
 from ce_gym.learn.runs.settings import GIVEN, by_name, config_file, make_settings, read_file, with_named
-from ce_gym.policies import environment_of, keep_map, load_policy, locate_policy
+from ce_gym.policies import environment_of, load_policy, locate_policy, shelf
 
 ALGORITHMS = ("ppo", "shac", "distill", "sb3")
 """Names of the learners, which are modules of `ce_gym.learn.learners` with `train(job)` and `Settings`."""
@@ -31,6 +31,7 @@ def make_job(
     threads: int | None = None,
     seconds: float = float("inf"),
     logs: Sequence[str] = (),
+    several: bool = False,
 ) -> Job:
     """Return a training run.
 
@@ -38,7 +39,8 @@ def make_job(
         env_id: Registered environment id; may be empty with `resume`.
         algo: One of `ALGORITHMS`; if empty, the learner of the resumed policy, or "ppo".
         settings: Settings that replace values of the file, by name or each as text `KEY=VALUE`.
-        out: Folder to write to; by default `runs/`, then the names of settings file, level and learner.
+        out: Folder to write to; by default the folder of the policy to resume, if its environment stays the same.
+            Otherwise `runs/`, then the names of settings file, level and learner, with a number if there is a run.
         seed: Seed of initial weights, exploration and environments.
         config: Settings file, or name of one in the folder of the learner, such as "mini_cheetah_stairs"; by default
             the file of the environment.
@@ -47,6 +49,7 @@ def make_job(
         threads: Processor threads; all usable cores if None.
         seconds: Longest training time [s].
         logs: Packages to which curves are also written: "tensorboard", "wandb", "trackio".
+        several: Whether the folder is for several runs, in subfolders.
 
     Raises:
         ValueError: If a setting, an argument or the policy cannot be used; one line.
@@ -63,11 +66,15 @@ def make_job(
     sources = {str(path): in_file, **continued, GIVEN: by_name(settings)}
     given, trained = dict(env_kwargs or {}), record.get("env_kwargs", {})
     level, suffix = given.get("transmission"), "" if algo == ALGORITHMS[0] else algo
+    if out is None and policy and not (several or config) and _goes_on(policy, record, env_id, given):
+        out = run_of(policy)
+    elif out is None:
+        out = unused_folder(Path("runs") / "-".join(filter(None, (path.stem, level, suffix))), several)
     return Job(
         algo=algo,
         env_id=env_id,
         settings=with_named(make_settings(kind, sources), given),
-        out=Path(out) if out else Path("runs") / "-".join(filter(None, (path.stem, level, suffix))),
+        out=Path(out),
         env_kwargs={**(trained if record and not config else {**trained, **env_args}), **given},
         seed=seed,
         threads=threads or usable_cores(),
@@ -75,6 +82,12 @@ def make_job(
         seconds=seconds,
         logs=tuple(logs),
     )
+
+
+def _goes_on(policy: Path, record: Mapping[str, Any], env_id: str, given: Mapping[str, Any]) -> bool:
+    """Return whether training continues the last policy of a run in the same environment."""
+    same = env_id == record["env"] and {**record["env_kwargs"], **given} == record["env_kwargs"]
+    return same and policy.stem == "policy" and not policy.is_relative_to(shelf())
 
 
 def _named_file(config: str | Path, folder: Path) -> Path:
@@ -85,8 +98,6 @@ def _named_file(config: str | Path, folder: Path) -> Path:
 
 def run_job(job: Job) -> Trained:
     """Make a training run, and return its policy; Ctrl-C saves the policy and stops."""
-    make_folder(job.out)
-    keep_map(job.env_kwargs, job.out)
     return learner(job.algo).train(job)
 
 

@@ -168,7 +168,7 @@ def test_import_is_light():
 
 
 def test_training_scripts_use_public_names_only():
-    public = ("ce_gym.adapters", "ce_gym.console", "ce_gym.learn", "ce_gym.policies", "ce_gym.viewer")
+    public = ("ce_gym.adapters", "ce_gym.console", "ce_gym.files", "ce_gym.learn", "ce_gym.policies", "ce_gym.viewer")
     public += ("ce_gym.__main__", "ce_gym.export.mujoco_twin")
     for path in TRAIN.rglob("*.py"):
         ours = {name for name in imported_modules(path) if name.startswith("ce_gym.")}

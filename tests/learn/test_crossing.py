@@ -31,7 +31,7 @@ STAND = Policy(
     lambda observation: np.zeros((len(observation), 12), "f4"),
     {
         "env": "ce_gym/MiniCheetahVelocity-v0",
-        "policy_spec": {"command": {}, "control_dt": 0.02},
+        "policy_spec": {"command": {"range": [[0, 1], [0, 0], [0, 0]]}, "control_dt": 0.02},
         "observation_size": 48,
     },
 )

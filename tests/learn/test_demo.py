@@ -29,7 +29,7 @@ def demo(tmp_path_factory):
 def test_the_last_line_is_the_page(demo, capsys):
     assert demo_main([*QUICK, "--out", str(demo)]) == 0
     output = capsys.readouterr().out
-    assert "--fresh trains a new one" in output  # the policy of the fixture is used again
+    assert "--force trains a new one" in output  # the policy of the fixture is used again
     for level in ("exact *", "coupled", "armature", "none"):
         assert level in output
     page = output.strip().splitlines()[-1]
@@ -67,8 +67,8 @@ def test_the_rollout_has_states_forces_and_commands(demo):
 
 
 @pytest.mark.slow
-def test_fresh_trains_again(demo, capsys):
-    assert demo_main([*QUICK, "--fresh", "--seed", "4", "--out", str(demo)]) == 0
+def test_force_trains_again(demo, capsys):
+    assert demo_main([*QUICK, "--force", "--seed", "4", "--out", str(demo)]) == 0
     assert "Training a new policy" in capsys.readouterr().out
     assert load_policy(demo / "policy.npz").record["seed"] == 4
 

@@ -18,7 +18,7 @@ from ce_gym.learn.runs.settings import CONFIG_FOLDER, SettingsError, load_settin
 from ce_gym.policies import load_policy
 
 ROBOT_ENV = next(iter(ce_gym.environment_ids()))
-SMALL = ["--num-envs", "8", "--steps", "64", "--threads", "1", "--episodes", "2", "--log"]
+SMALL = ["--num-envs", "8", "--steps", "64", "--threads", "1", "--episodes", "2", "--logs"]
 SMALL += ["--set", "rollout=8", "minibatches=1", "epochs=1", "hidden=[8]", "training={}"]
 
 

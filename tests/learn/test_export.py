@@ -243,7 +243,7 @@ def test_mistakes_are_one_line(tmp_path, capsys):
         (["export", tmp_path / "missing.zip"], "missing.zip: no such policy"),
         (
             ["export", path, "--out", tmp_path / "record.onnx"],
-            "record.json: cannot be written: exists already and is not",
+            "record.json: cannot be written: exists already",
         ),
         (["export", path, "--out", tmp_path / "nowhere" / "out.onnx"], "cannot be written"),
         (

@@ -23,7 +23,7 @@ def written_rows(folder) -> list[dict[str, float]]:
 
 def test_tensorboard_reads_what_the_log_has(tmp_path):
     reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-    assert main(["train", ID, "--out", str(tmp_path), *FAST, "steps=8192", "--log", "tensorboard"]) == 0
+    assert main(["train", ID, "--out", str(tmp_path), *FAST, "steps=8192", "--logs", "tensorboard"]) == 0
     events = reader.EventAccumulator(str(tmp_path)).Reload()
     rows = written_rows(tmp_path)
     assert set(events.Tags()["scalars"]) == set(rows[0])
@@ -63,7 +63,7 @@ def test_a_tracker_gets_settings_and_the_numbers_of_each_row(package, tmp_path, 
 
 def test_a_package_that_is_missing_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "wandb", None)
-    assert main(["train", ID, "--out", str(tmp_path), *FAST, "--log", "wandb"]) == 2
+    assert main(["train", ID, "--out", str(tmp_path), *FAST, "--logs", "wandb"]) == 2
     assert 'needs wandb, which is not installed: pip install "wandb"' in capsys.readouterr().err
 
 

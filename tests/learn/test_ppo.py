@@ -184,7 +184,7 @@ def test_resuming_restores_all_that_learning_changes(trained, tmp_path):
 
 
 def test_resuming_goes_on_with_environment_and_settings_of_the_run(trained, tmp_path, capsys):
-    brief = ["--episodes", "4", "--threads", "1", "--log"]
+    brief = ["--episodes", "4", "--threads", "1", "--logs"]
     assert main(["train", "--resume", str(trained.parent), "--steps", "1024", "--out", str(tmp_path), *brief]) == 0
     assert "forward speed error" in capsys.readouterr().out
     record = load_policy(tmp_path).record

@@ -13,7 +13,7 @@ from ce_gym.learn.training import learner
 
 SMALL = ["num_envs=64", "rollout=16", "hidden=[16]", "epochs=4", "minibatches=2", "learning_rate=1e-2", "target_kl=0"]
 SMALL += ["gamma=0.9", "training={}"]
-FAST = ["--log", "--episodes", "8", "--threads", "1", "--set", *SMALL]
+FAST = ["--logs", "--episodes", "8", "--threads", "1", "--set", *SMALL]
 
 
 def job(out: Path, steps: int, env: str = ID, settings=(), **changes) -> Job:

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from pathlib import Path
 from typing import Any
 
-from ce_gym.console import EPISODES, NUM_ENVS, SEED, STEPS, above_zero, add_command, add_threads_argument
+from ce_gym.console import (
+    EPISODES,
+    NUM_ENVS,
+    SEED,
+    STEPS,
+    above_zero,
+    add_command,
+    add_force_argument,
+    add_threads_argument,
+    path,
+)
 from ce_gym.learn.commands.errors import in_one_line
+from ce_gym.learn.runs.folder import check_unused
 from ce_gym.learn.runs.job import Job
 from ce_gym.learn.runs.logs import LOGS, default_logs
 from ce_gym.learn.study import study_jobs, unfinished
@@ -23,8 +33,8 @@ def add_train_command(subparsers: Any) -> None:
         subparsers,
         train,
         "train a policy",
-        "Train a policy, evaluate it and print its path. Ctrl-C and SIGTERM save the policy and stop; --resume "
-        "continues.\nSettings not named here are in the settings file; --set KEY=VALUE changes any of them.\n"
+        "Train a policy, evaluate it and print its path. Ctrl-C, SIGTERM and SIGHUP save the policy and stop; "
+        "--resume continues.\nSettings not named here are in the settings file; --set KEY=VALUE changes any of them.\n"
         "Several levels or seeds are trained one after the other, in subfolders LEVEL/seed_N. Finished policies are "
         "kept.",
         "train ce_gym/MiniCheetahVelocity-v0",
@@ -45,24 +55,26 @@ def add_train_command(subparsers: Any) -> None:
         "policy from which to continue, with its settings unless --config is given; --steps includes its steps; no "
         "code in the file is run"
     )
-    what.add_argument("--resume", type=Path, metavar="POLICY", help=text)
+    what.add_argument("--resume", type=path, metavar="POLICY", help=text)
     seeds = what.add_mutually_exclusive_group()
     seeds.add_argument("--seed", type=SEED, default=0, metavar="N", help="random seed (default 0)")
     seeds.add_argument("--seeds", type=SEED, nargs="+", metavar="N", help="several seeds")
     how = parser.add_argument_group("how")
     text = "settings file, or the name of one such as mini_cheetah_stairs (default: that of the environment)"
-    how.add_argument("--config", type=Path, metavar="FILE", help=text)
+    how.add_argument("--config", type=path, metavar="FILE", help=text)
     text = "settings, such as gamma=0.98"
     how.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=text)
     how.add_argument("--steps", type=STEPS, metavar="N", help="environment steps in all, such as 6e6")
     how.add_argument("--num-envs", type=NUM_ENVS, metavar="N", help="environments stepped in parallel")
-    text = "longest training time [min]"
-    how.add_argument("--minutes", type=above_zero, default=float("inf"), metavar="M", help=text)
+    text = "longest training time [s]"
+    how.add_argument("--seconds", type=above_zero, default=float("inf"), metavar="T", help=text)
     add_threads_argument(how)
     where = parser.add_argument_group("output")
-    where.add_argument("--out", type=Path, metavar="FOLDER", help="default: runs/<name of the settings file>")
+    text = "default: the folder of --resume, or a new one, runs/<name of the settings file>"
+    where.add_argument("--out", type=path, metavar="FOLDER", help=text)
+    add_force_argument(where)
     text = f"also write curves for {', '.join(LOGS)} (default: tensorboard if it is installed)"
-    where.add_argument("--log", nargs="*", choices=LOGS, metavar="PACKAGE", help=text)
+    where.add_argument("--logs", nargs="*", choices=LOGS, metavar="PACKAGE", help=text)
     where.add_argument("--page", action="store_true", help="show curves and the current policy in a browser")
     text = "episodes of the evaluation, in parallel (default 256)"
     where.add_argument("--episodes", type=EPISODES, default=256, metavar="N", help=text)
@@ -76,6 +88,8 @@ def train(args: argparse.Namespace) -> int:
 
     jobs = make_jobs(args)
     registered(jobs[0].env_id)  # an unknown environment is an error before any output
+    if len(jobs) == 1:
+        check_unused(jobs[0].out, jobs[0].resume)
     with TrainingPage([job.out for job in jobs], jobs[0].env_id) if args.page else contextlib.nullcontext():
         for job in jobs:
             remaining = unfinished(job) if len(jobs) > 1 else job
@@ -112,6 +126,6 @@ def make_jobs(args: argparse.Namespace) -> list[Job]:
         config=args.config,
         resume=args.resume,
         threads=args.threads,
-        seconds=60.0 * args.minutes,
-        logs=default_logs() if args.log is None else args.log,
+        seconds=args.seconds,
+        logs=default_logs() if args.logs is None else args.logs,
     )

@@ -218,8 +218,8 @@ def write_card(
     """Evaluate a policy, write `card.md`, `curve.png` and `policy.npz`, and return the card's path and the results.
 
     The files are written to `out`, to the folder of shipped policies if `ship` is true, and to the folder of the policy
-    otherwise, where an existing `policy.npz` stays as it is. For `task`, see `short_name`; for `episodes`, `sim2sim_episodes` and `levels`, `card_results`; for `env`,
-    `env_args` and `threads`, `evaluation.load`.
+    otherwise, where an existing `policy.npz` stays as it is. For `task`, see `short_name`; for `episodes`,
+    `sim2sim_episodes` and `levels`, `card_results`; for `env`, `env_args` and `threads`, `evaluation.load`.
 
     Raises:
         PolicyError: If the policy cannot be used.

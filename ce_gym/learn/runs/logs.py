@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 LOGS = ("tensorboard", "wandb", "trackio")
-"""Packages that `--log` names."""
+"""Packages that `--logs` names."""
 
 PROJECT = "ce_gym"
 """Name of the project at Weights & Biases and trackio; a run has the name of its folder."""

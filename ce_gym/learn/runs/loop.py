@@ -7,6 +7,7 @@ and `packages`, recorded with their versions.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import sys
@@ -23,11 +24,12 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 
 from ce_gym.console import file_error
-from ce_gym.learn.runs.folder import continue_if_full, make_folder, write_whole
+from ce_gym.files import write_whole
+from ce_gym.learn.runs.folder import continue_if_full, remove, run_folder
 from ce_gym.learn.runs.job import Job, Trained, acting_environment, make_record
 from ce_gym.learn.runs.logs import open_trackers
 from ce_gym.learn.runs.progress import Log, ProgressBar, StopInOrder
-from ce_gym.policies import Policy, PolicyError, locate_policy, write_npz
+from ce_gym.policies import Policy, PolicyError, keep_map, locate_policy, write_npz
 
 CHECKPOINTS = 10
 """Checkpoints per training run."""
@@ -44,27 +46,29 @@ def run_learner(kind: Callable[[VectorEnv, Job], Any], job: Job) -> Trained:
         job: The training run.
 
     Raises:
+        OSError: If the folder has another run or another owner, or cannot be written.
         PolicyError: If the policy to resume does not fit the environment or the settings.
     """
     state = locate_policy(job.resume).with_suffix(".learner.npz") if job.resume else None
     if state and not state.exists():
         raise PolicyError(f"{state}: no such file; expected the file that its learner writes beside a policy")
-    make_folder(job.out)
     options = {"dtype": "float32", "num_threads": job.threads, "autoreset_mode": AutoresetMode.SAME_STEP}
     mode, num_envs = gymnasium.VectorizeMode.VECTOR_ENTRY_POINT, job.settings.num_envs
     options |= {**job.env_kwargs, **job.settings.training}
-    envs = gymnasium.make_vec(job.env_id, num_envs=num_envs, vectorization_mode=mode, **options)
-    try:
-        learner = kind(envs, job)
-        if state:
-            restore(learner, state)
-        return _learn(learner, job)
-    finally:
-        envs.close()
+    with run_folder(job.out, job.resume) as replaced:
+        envs = gymnasium.make_vec(job.env_id, num_envs=num_envs, vectorization_mode=mode, **options)
+        with contextlib.closing(envs):
+            learner = kind(envs, job)
+            if state:
+                restore(learner, state)
+            return _learn(learner, job, replaced)
 
 
-def _learn(learner: Any, job: Job) -> Trained:
-    """Run the learner to the end, to the deadline or to Ctrl-C, and save."""
+def _learn(learner: Any, job: Job, replaced: list[Path]) -> Trained:
+    """Run the learner to the end, to the deadline or to Ctrl-C, and save.
+
+    The first update removes the files `replaced` of an earlier run.
+    """
     s, native = job.settings, acting_environment(job, learner.envs.unwrapped)
     log = Log(job.out, job.resume, learner.steps, open_trackers(job.logs, job.out, s.as_dict()))
     bar = ProgressBar(s.steps, learner.steps)
@@ -76,10 +80,14 @@ def _learn(learner: Any, job: Job) -> Trained:
         spent = {name: round(now - start, 1) for (name, now), start in zip(spent.items(), started, strict=True)}
         return make_record(job, native, learner.steps, packages) | spent | {"finished": finished}
 
-    with StopInOrder(job.seconds) as stop:
+    with StopInOrder(job.seconds) as stop, contextlib.closing(bar.bar):
         while learner.steps < s.steps and not stop.due:
             checkpoints = learner.steps // checkpoint
             figures, means = learner.iterate(), learner.episodes.means()
+            if not stop.has_progress:
+                remove(replaced)
+                keep_map(job.env_kwargs, job.out)
+                stop.has_progress = True
             if means:
                 log.add(learner.steps, means, figures)
             bar.show(learner)
@@ -89,8 +97,7 @@ def _learn(learner: Any, job: Job) -> Trained:
                 if time.monotonic() >= due:
                     due = time.monotonic() + PERIOD
                     save(learner, record(), job.out / "policy")
-        bar.bar.close()
-        log.close()
+    log.close()
     written = record(finished=not stop.interrupted) | {"ended": True}
     try:
         policy = save(learner, written, job.out / "policy")

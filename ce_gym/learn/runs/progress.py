@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import os
 import signal
+import stat
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -14,11 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ce_gym.learn.runs.folder import continue_if_full
+from ce_gym.learn.runs.folder import LOG, continue_if_full, run_of
 from ce_gym.policies import locate_policy
-
-LOG = "progress.csv"
-"""Name of the file of statistics in the folder of a run."""
 
 STEPS, SECONDS, REWARD, LENGTH = (
     "time/total_timesteps", "time/time_elapsed", "rollout/ep_rew_mean", "rollout/ep_len_mean",
@@ -82,12 +82,11 @@ class Log:
 
     def __init__(self, folder: Path, resume: Path | None, steps: int, trackers: Sequence[Any] = ()) -> None:
         self.file, self.trackers = folder / LOG, trackers
-        run = locate_policy(resume).parent if resume else folder
-        earlier = read_rows((run.parent if run.name == "checkpoints" else run) / LOG) if resume else []
+        earlier = read_rows(run_of(locate_policy(resume)) / LOG) if resume else []
         self.rows: list[Mapping[str, Any]] = [row for row in earlier if row[STEPS] <= steps]
         self.columns = list(dict.fromkeys(name for row in self.rows for name in row))
         self.started = time.perf_counter() - (self.rows[-1][SECONDS] if self.rows else 0.0)
-        self._write(self.rows, "w")
+        self._begun = False
 
     def add(self, steps: int, means: Mapping[str, float], figures: Mapping[str, float]) -> None:
         """Write one row with its time. If the row has new columns, write the whole file again.
@@ -102,7 +101,8 @@ class Log:
         self.rows.append(row)
         new = [name for name in row if name not in self.columns]
         self.columns += new
-        self._write(self.rows if new else [row], "w" if new else "a")
+        whole, self._begun = bool(new) or not self._begun, True
+        self._write(self.rows if whole else [row], "w" if whole else "a")
         for tracker in self.trackers:
             with continue_if_full():
                 tracker.log(row, step=steps)
@@ -178,30 +178,37 @@ def fall_cost(most: float, done: float) -> float:
 
 
 class StopInOrder:
-    """Context that ends training between two updates: at a deadline, after Ctrl-C or after SIGTERM.
+    """Context that ends training between two updates: at a deadline, after Ctrl-C, SIGTERM or SIGHUP.
 
-    A second signal interrupts immediately.
+    A second signal, or a signal before the first update, interrupts immediately. A signal that the process ignores, as
+    SIGHUP under `nohup`, stays ignored.
 
     Args:
         seconds: Longest time to train [s].
 
     Attributes:
         interrupted: Whether a signal ended training.
+        has_progress: Whether there is an update to save.
     """
 
     def __init__(self, seconds: float = float("inf")) -> None:
-        self.interrupted, self._deadline = False, time.monotonic() + seconds
+        self.interrupted, self.has_progress = False, False
+        self._deadline = time.monotonic() + seconds
 
     def __enter__(self) -> StopInOrder:
-        self._previous = {number: signal.signal(number, self._on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+        numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+        heard = [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+        self._previous = {number: signal.signal(number, self._on_signal) for number in heard}
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, previous in self._previous.items():
             signal.signal(number, previous)
 
-    def _on_signal(self, *_: object) -> None:
-        if self.interrupted:
+    def _on_signal(self, number: int, _: object) -> None:
+        if number == getattr(signal, "SIGHUP", None):
+            leave_terminal()
+        if self.interrupted or not self.has_progress:
             raise KeyboardInterrupt
         self.interrupted = True
 
@@ -209,6 +216,16 @@ class StopInOrder:
     def due(self) -> bool:
         """Whether to stop now."""
         return self.interrupted or time.monotonic() >= self._deadline
+
+
+def leave_terminal() -> None:
+    """Discard what is printed from now on, because the terminal that shows it is closing or has closed."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            if stat.S_ISCHR(os.fstat(stream.fileno()).st_mode):
+                os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
 
 
 class ProgressBar:
@@ -221,10 +238,10 @@ class ProgressBar:
 
     def __init__(self, total: int, steps: int) -> None:
         interval = 0.5 if sys.stderr.isatty() else 10.0  # fewer lines in a log file
-        form = "{percentage:3.0f}% |{bar:20}| {n_fmt}/{total_fmt} steps, {rate_fmt}, {remaining} left {postfix}"
+        form = "{percentage:3.0f}% |{bar:20}| {n_fmt}/{total_fmt} steps, {rate_fmt}, {remaining} left{postfix}"
         options = {"unit": " steps", "unit_scale": True, "dynamic_ncols": True, "smoothing": 0.05}
         self.bar: Any = tqdm(total=total, initial=steps, mininterval=interval, bar_format=form, **options)
-        self.bar.set_postfix_str("| the first run also compiles the learner")
+        self.bar.set_postfix_str("first update")
         self.started = time.perf_counter()
 
     def show(self, learner: Any) -> None:
@@ -232,8 +249,11 @@ class ProgressBar:
         total, means = time.perf_counter() - self.started, learner.episodes.means()
         physics, collecting = learner.step_seconds / total, learner.collect_seconds / total
         shares = f"physics {physics:.0%} policy {collecting - physics:.0%} learning {1 - collecting:.0%}"
-        self.bar.set_postfix_str(f"| {_figures(means)} | {shares}", refresh=False)
-        self.bar.update(min(learner.steps, self.bar.total) - self.bar.n)
+        self.bar.set_postfix_str(f"{_figures(means)} | {shares}", refresh=False)
+        try:
+            self.bar.update(min(learner.steps, self.bar.total) - self.bar.n)
+        except OSError:
+            leave_terminal()
 
 
 def _figures(means: Mapping[str, float]) -> str:
