@@ -20,8 +20,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from ce_gym.archive import read_json, read_npz
 from ce_gym.files import POLICY, written
+from ce_gym.model.formats.archive import read_json, read_npz
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.errors import LevelWarning, PolicyError
 from ce_gym.policies.onnx_reader import policy_of_onnx

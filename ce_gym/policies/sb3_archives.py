@@ -7,7 +7,7 @@ import re
 import zipfile
 from pathlib import Path
 
-from ce_gym.archive import read_member
+from ce_gym.model.formats.archive import read_member
 from ce_gym.policies.actor import ACTIVATIONS, Array
 from ce_gym.policies.weights import read_weights
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.archive import read_member
+from ce_gym.model.formats.archive import read_member
 
 
 def read_weights(file: Path, member: str = "policy.pth") -> dict[str, Any]:

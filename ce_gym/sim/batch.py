@@ -6,18 +6,20 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.model.coordinates import unit_quaternions
+from ce_gym.model.formats.archive import read_npz
 from ce_gym.sim.devices import Array, Device
 from ce_gym.sim.schema import Row
 from ce_gym.sim.substeps import FRAME, HEIGHTS
 from ce_gym.sim.terrain import Terrain
 
 File = str | os.PathLike[str]
+LARGEST_HEADER = 2**20
+"""Most bytes of a snapshot's file beyond its numbers: names, types and shapes of arrays."""
 Snapshot = Mapping[str, NDArray]
 """The state of a batch: rows of robots by name, copies in the memory of the CPU."""
 
@@ -104,11 +106,12 @@ class Batch:
         """Continue from a snapshot, or from a file with one.
 
         Raises:
-            ValueError: If the snapshot is from another kind of batch, or has a quaternion that is not of unit length.
-                Then nothing has been changed.
+            ValueError: If the snapshot is from another kind of batch or on other ground, or has a number out of range
+                or a quaternion that is not of unit length. Then nothing has been changed.
         """
-        state = snapshot if isinstance(snapshot, Mapping) else load_snapshot(snapshot)
         expected = self.snapshot()
+        most_bytes = LARGEST_HEADER + sum(rows.nbytes for rows in expected.values())
+        state = snapshot if isinstance(snapshot, Mapping) else load_snapshot(snapshot, most_bytes)
         for name in sorted(expected.keys() ^ state.keys()):
             there = "missing" if name in expected else "not part of this state"
             raise ValueError(f"snapshot: {name!r} is {there}; expected one of the same robot, scene and task")
@@ -117,18 +120,25 @@ class Batch:
             if (got.shape, got.dtype) != (rows.shape, rows.dtype):
                 wanted = f"{rows.dtype} {rows.shape}"
                 raise ValueError(f"snapshot: {name!r} is {got.dtype} {got.shape}; expected {wanted}")
+            self.schema[name].check_values(got)
+            if name == FRAME and not np.array_equal(got, rows):
+                raise ValueError(f"snapshot: {name!r} differs; expected one on the same ground")
         for name, rows in {name: self.unit(name, np.asarray(state[name]), "snapshot: ") for name in expected}.items():
             self.write(name, rows)
 
 
-def load_snapshot(file: File) -> Snapshot:
+def load_snapshot(file: File, most_bytes: int) -> Snapshot:
     """Read a snapshot from a file, without executing code from the file.
 
+    Args:
+        file: A regular file.
+        most_bytes: Limit on the unpacked size.
+
     Raises:
-        ValueError: If the file has no snapshot; one line.
+        ValueError: If the file has no snapshot, or a larger one; one line.
     """
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, BadZipFile) as problem:
+        return read_npz(Path(file), most_bytes)
+    except Exception as error:  # damaged files raise errors of many classes
+        problem = " ".join(str(error).split())[:200]
         raise ValueError(f"snapshot {os.fspath(file)!r}: {problem}; expected a file that `snapshot` wrote") from None

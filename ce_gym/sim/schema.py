@@ -5,19 +5,19 @@ Arrays on a device, buffers of kernels, resets, snapshots and copies follow from
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ce_gym.compile import Buffer
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import Rates
 from ce_gym.dynamics.laws.scene_laws import output_sizes, state_fields
-from ce_gym.dynamics.laws.scene_parameters import parameter_defaults
+from ce_gym.dynamics.laws.scene_parameters import check_parameter, parameter_defaults
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.step_size import control_sizes
 from ce_gym.model.arguments import check
@@ -34,6 +34,13 @@ FIRST = 10
 """Length of a sub-step over the length of the first step that a robot tries."""
 
 
+LARGEST = float(np.finfo(float).max)
+FINITE = (-LARGEST, LARGEST)
+"""Bounds of rows that hold any finite number."""
+COUNT = (0.0, LARGEST)
+"""Bounds of rows that count."""
+
+
 @dataclass(frozen=True)
 class Row:
     """One state buffer.
@@ -47,6 +54,8 @@ class Row:
         reset: Value after a reset, a number or shape (size,).
         dtype: Of a plain array, shape (num_envs, size), or (num_envs,) for size 0; "" for an array in lanes.
         quaternions: Rows at which unit quaternions begin.
+        bounds: Smallest and largest number that a snapshot may hold; None for rows that no step reads.
+        check: Further check of the rows in a snapshot, shape (num_envs, size); raises ValueError.
     """
 
     name: str
@@ -55,6 +64,22 @@ class Row:
     reset: ArrayLike = 0.0
     dtype: str = ""
     quaternions: tuple[int, ...] = ()
+    bounds: tuple[float, float] | None = None
+    check: Callable[[NDArray], None] | None = None
+
+    def check_values(self, values: NDArray) -> None:
+        """Check the numbers of a snapshot, shape (num_envs, size).
+
+        Raises:
+            ValueError: A number is out of bounds.
+        """
+        if self.bounds is not None:
+            low, high = self.bounds
+            if wrong := values[~((values >= low) & (values <= high))].tolist():
+                expected = "a finite number" if self.bounds == FINITE else f"a number from {low:g} to {high:g}"
+                raise ValueError(f"snapshot: {self.name!r} holds {wrong[0]:g}; expected {expected}")
+        if self.check is not None:
+            self.check(values)
 
 
 def physics_rows(
@@ -76,23 +101,40 @@ def physics_rows(
             check("method", options.method, field.explicit, f"an implicit one: the state has the {field.meaning}")
     turns = {"q": tuple(i for i, _ in model.robot.layout.turns)}
     rows = [
-        Row(field.name, field.size, "physics", start.get(field.name, 0.0), quaternions=turns.get(field.name, ()))
+        Row(
+            field.name,
+            field.size,
+            "physics",
+            start.get(field.name, 0.0),
+            quaternions=turns.get(field.name, ()),
+            bounds=FINITE,
+        )
         for field in fields
     ]
-    rows += [Row("diverged", 1, "physics"), Row("retries", 1, "physics")]
+    rows += [Row("diverged", 1, "physics", bounds=(0.0, 1.0)), Row("retries", 1, "physics", bounds=COUNT)]
     sizes = output_sizes(model.mechanism, options)
     rows += [Row(name, size, "physics") for name in outputs if (size := sizes.get(name, 1))]
     if options.parameters:
         defaults = parameter_defaults(model.robot, options.material, options.parameters)
         values = np.concatenate(list(defaults.values()))
-        rows.append(Row("parameters", len(values), "host", values))
+
+        def check_values(rows: NDArray) -> None:
+            parts = np.split(rows, np.cumsum([len(value) for value in defaults.values()])[:-1], axis=1)
+            for name, part in zip(defaults, parts, strict=True):
+                check_parameter(model.robot, name, part)
+
+        rows.append(Row("parameters", len(values), "host", values, check=check_values))
     if METHODS[options.method].controlled:
         first = {"step_length": dt / FIRST}
         sizes = control_sizes(model.robot.layout)
-        rows += [Row(name, size, "physics", first.get(name, 0.0)) for name, size in sizes.items() if name != TOLERATED]
+        rows += [
+            Row(name, size, "physics", first.get(name, 0.0), bounds=FINITE)
+            for name, size in sizes.items()
+            if name != TOLERATED
+        ]
         rows.append(Row(TOLERATED, 1, "scene", TOLERANCE if tolerance is None else tolerance))
     rows.append(Row(DT, 1, "scene", dt))
-    return rows + ([Row(FRAME, 3, "host")] if options.ground == "field" else [])
+    return rows + ([Row(FRAME, 3, "host", bounds=FINITE)] if options.ground == "field" else [])
 
 
 def state_buffers(rows: Iterable[Row]) -> list[Buffer]:

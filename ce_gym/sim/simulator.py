@@ -28,11 +28,11 @@ from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.ground_clearance import GroundClearance
 from ce_gym.sim.interruptible_runs import is_long, run_substeps
 from ce_gym.sim.scene import resolve_scene
-from ce_gym.sim.schema import Row, Steps, physics_rows
+from ce_gym.sim.schema import COUNT, Row, Steps, physics_rows
 from ce_gym.sim.substeps import COMMAND, CONTROLLER, load_step_kernel
 from ce_gym.sim.terrain import Terrain
 
-FAILURES = Row("failures", 0, "host", dtype="int64")
+FAILURES = Row("failures", 0, "host", dtype="int64", bounds=COUNT)
 """How many times each robot has diverged and been reset."""
 
 

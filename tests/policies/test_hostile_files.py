@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from stander import record, stander, write_small, write_zip
 
-from ce_gym.archive import MOST_BYTES
+from ce_gym.model.formats.archive import MOST_BYTES
 from ce_gym.policies import PolicyError, find_policy, load_policy
 from ce_gym.viewer import Rollout, RolloutError
 

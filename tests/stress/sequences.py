@@ -36,6 +36,8 @@ class Beside:
 
     OF_CALLS: tuple[str, ...] = ()
     """What is kept of the last call on all robots, whomever it concerned."""
+    READ: tuple[str, ...] = ("q", "v", "load", "anchor")
+    """Rows of a snapshot that a step reads."""
 
     def __init__(self, batch: Any, alone: dict[int, Any]) -> None:
         self.batch, self.alone = batch, alone
@@ -67,6 +69,21 @@ class Beside:
         """Go on with a copy."""
         self.batch = copy.deepcopy(self.batch) if rng.random() < 0.5 else pickle.loads(pickle.dumps(self.batch))
 
+    def damaged(self, rng: np.random.Generator) -> None:
+        """Restore snapshots with a number, a name or a shape that is wrong: all are refused, and nothing changes."""
+        state = {name: array.copy() for name, array in self.batch.snapshot().items()}
+        name = str(rng.choice(self.READ))
+        damage = rng.integers(4)
+        if damage == 0:
+            state[name].reshape(-1)[rng.integers(state[name].size)] = rng.choice([np.nan, -np.inf])
+        elif damage == 1:
+            state["failures"][rng.integers(N)] = -1
+        elif damage == 2:
+            state[name] = state[name][:-1] if rng.random() < 0.5 else state[name].astype("f2")
+        else:
+            state[f"{name}_"] = state.pop(name)
+        expect_refusal(lambda: self.batch.restore(state))
+
     def some(self, rng: np.random.Generator) -> NDArray[np.bool_]:
         """Choose robots, at least one."""
         chosen = rng.random(N) < 0.4
@@ -85,7 +102,7 @@ class Beside:
 class Simulators(Beside):
     """Robots without a task."""
 
-    OPERATIONS = ("step", "reset", "place", "diverge", "keep", "restore", "copied", "refused")
+    OPERATIONS = ("step", "reset", "place", "diverge", "keep", "restore", "copied", "refused", "damaged")
 
     def __init__(self, robot: str) -> None:
         self.model = Model(robot)
@@ -133,7 +150,7 @@ class Simulators(Beside):
 class Environments(Beside):
     """Robots with a task, in a vector environment."""
 
-    OPERATIONS = ("step", "reset", "diverge", "keep", "restore", "copied", "refused", "close")
+    OPERATIONS = ("step", "reset", "diverge", "keep", "restore", "copied", "refused", "damaged", "close")
     OF_CALLS = ("chosen",)  # the mask of the last reset
 
     def __init__(self, robot: str, mode: str = "SameStep") -> None:
@@ -168,7 +185,7 @@ class Environments(Beside):
         chosen = self.some(rng)
         for envs, rows in ((self.batch, chosen), *((one, chosen[i : i + 1]) for i, one in self.alone.items())):
             v = envs.batch.rows("v")
-            v[rows, -1] = np.nan
+            v[rows, -1] = 1e9
             envs.batch.write("v", v)
 
     def refused(self, rng: np.random.Generator) -> None:

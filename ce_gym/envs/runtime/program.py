@@ -17,11 +17,11 @@ from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, Step
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.runtime.spec import TaskSpec
 from ce_gym.envs.runtime.stages import OUTCOME, Stages
-from ce_gym.sim.schema import Row, physics_rows, state_buffers
+from ce_gym.sim.schema import COUNT, FINITE, Row, physics_rows, state_buffers
 from ce_gym.sim.substeps import FRAME, HEIGHTS, substeps
 
 HOST_ROWS = (
-    Row("limit", 1, "host", np.inf),
+    Row("limit", 1, "host", np.inf, bounds=(0.0, np.inf)),
     Row("keys", 0, "host", dtype="int64"),
     Row("counters", 0, "host", dtype="int64"),
     Row("seeded", 0, "host", dtype="bool"),
@@ -59,8 +59,9 @@ class TaskProgram(TaskSpec):
         }
         physics = physics_rows(self.model, self.options, outputs, self.task.dt, self.task.tolerance)
         rows = [replace(row, writer="task") if row.name == "parameters" else row for row in (*physics, *HOST_ROWS)]
-        rows += [Row(name, size, "task") for name, size in sizes.items() if size]
-        rows += [Row(FRAME, 3, "host")] if self.ground and not self.contacts else []
+        bounds = dict.fromkeys(("clock", "elapsed", "failures"), COUNT) | {"draw": (0.0, 1.0)}
+        rows += [Row(name, size, "task", bounds=bounds.get(name, FINITE)) for name, size in sizes.items() if size]
+        rows += [Row(FRAME, 3, "host", bounds=FINITE)] if self.ground and not self.contacts else []
         return {row.name: row for row in rows}
 
     @cached_property

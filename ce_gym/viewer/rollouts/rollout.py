@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ce_gym.archive import read_npz
 from ce_gym.files import ROLLOUT, written
+from ce_gym.model.formats.archive import read_npz
 from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.rollouts.ground_patch import Heights
 
