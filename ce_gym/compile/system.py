@@ -1,10 +1,11 @@
-"""Differences of operating systems: users, usable cores, names of CPUs, forks, locks of files.
+"""Differences of operating systems: users, usable cores, memory, names of CPUs, forks, locks of files.
 
 Only this file calls functions that some system lacks.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import sys
@@ -13,6 +14,8 @@ from pathlib import Path
 
 CPUINFO = Path("/proc/cpuinfo")
 """Description of the CPU on Linux."""
+CONTAINER = Path("/sys/fs/cgroup/memory.max")
+"""Limit on the memory of a container on Linux."""
 
 
 def _nothing() -> None:
@@ -49,6 +52,36 @@ def usable_cores() -> int:
     """
     affinity = getattr(os, "sched_getaffinity", None)
     return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def memory() -> float:
+    """Return the memory that this process may use [bytes]; inf where the system does not tell."""
+    sizes = [float("inf")]
+    if hasattr(os, "sysconf"):
+        sizes.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    with contextlib.suppress(OSError, ValueError):  # "max" is no number
+        sizes.append(int(CONTAINER.read_text()))
+    with contextlib.suppress(ImportError):
+        import resource
+
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        sizes += [limit] if limit != resource.RLIM_INFINITY else []
+    return min(sizes)
+
+
+def check_memory(argument: str, needed: float) -> None:
+    """Check an estimate before memory is allocated.
+
+    Args:
+        argument: The argument with its value, for the message.
+        needed: Estimate [bytes].
+
+    Raises:
+        ValueError: More than this process may use; one line.
+    """
+    if not needed <= (most := memory()):
+        gib = f"{needed / 2**30:.3g} GiB of memory; expected at most {most / 2**30:.3g} GiB, what there is"
+        raise ValueError(f"{argument} needs {gib}")
 
 
 def processor() -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ce_gym.compile.system import check_memory
 from ce_gym.model.coordinates import unit_quaternions
 from ce_gym.model.formats.archive import read_npz
 from ce_gym.sim.devices import Array, Device
@@ -35,6 +36,9 @@ class Batch:
         terrain: The ground, if it is a field.
         num_threads: Threads that share the robots.
 
+    Raises:
+        ValueError: If the state does not fit into memory.
+
     Attributes:
         schema: Rows by name.
         arrays: Arrays of the rows, by name.
@@ -51,6 +55,9 @@ class Batch:
         num_threads: int = 1,
     ) -> None:
         self.schema = {row.name: row for row in rows}
+        if device.name == "cpu":
+            numbers = sum(row.size or 1 for row in self.schema.values())
+            check_memory(f"num_envs={num_envs}", num_envs * numbers * np.dtype(dtype).itemsize)
         self.num_envs, self.dtype, self.place, self.num_threads = num_envs, dtype, device, num_threads
         self.arrays = {name: self._array(row) for name, row in self.schema.items()}
         self.tables: dict[str, Array] = {}

@@ -75,7 +75,7 @@ class Simulator:
             a motor.
 
     Raises:
-        ValueError: If an argument is not one of the choices.
+        ValueError: If an argument is not one of the choices, or the robots do not fit into memory.
 
     Examples:
         A thousand robots stand for a second, and the ground carries their weight:
@@ -128,13 +128,13 @@ class Simulator:
         self.target_names = target_names(model.mechanism, self.options.control)
         asked = tuple(name for name in OUTPUTS if name in outputs)
         self._addresses = self._addresses_of(controller)
-        self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device, controller is not None)
         self._section = CriticalSection(f"Simulator of {num_envs} {model.robot.name}")
         fields = state_fields(model.mechanism, self.options)
         self._memory = [field for field in fields if field.name not in ("q", "v", "dependent")]
         ground = terrain if self.options.ground == "field" else None
         rows = [*physics_rows(model, self.options, asked, self.dt, self.scene.tolerance), FAILURES]
         self._batch = Batch(rows, num_envs, dtype, self._device, ground)
+        self._kernel = load_step_kernel(model, self.options, asked, dtype, self._device, controller is not None)
         self._arrays = self._batch.arrays
         ends = np.cumsum([0, *(len(default) for default in defaults.values())])
         self._columns = {name: slice(*ends[i : i + 2]) for i, name in enumerate(defaults)}

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import random
+import warnings
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -53,6 +56,92 @@ def test_a_picture_is_seen_from_above(tmp_path, file, depth, kind):
     expected = ce_gym.Terrain.from_file(file, CELL)
     np.testing.assert_allclose(shown.heights, expected.heights, atol=0.05 / depth)
     assert shown.origin == expected.origin
+
+
+PICTURES = [
+    ("hill.png", "L"), ("hill.png", "P"), ("hill.png", "RGB"), ("hill.png", "LA"), ("hill.png", "RGBA"),
+    ("hill.png", "I;16"), ("hill.tif", "L"), ("hill.tif", "I;16"), ("hill.tif", "I;16B"), ("hill.bmp", "L"),
+    ("hill.gif", "P"), ("hill.pgm", "L"), ("hill.pgm", "I;16"), ("hill.ppm", "RGB"), ("hill.jpg", "L"),
+    ("hill.webp", "RGB"),
+]  # fmt: skip
+"""Files of pictures, and kinds of pixels."""
+
+
+def save_picture(path, kind):
+    """Save the heights as a picture; return the value of white."""
+    image = pytest.importorskip("PIL.Image")
+    white = 65535 if kind.startswith("I") else 255
+    pixels = np.round(HEIGHTS / HEIGHTS.max() * white).astype(">u2" if kind == "I;16B" else np.uint16)[:, ::-1].T.copy()
+    picture = image.fromarray(pixels if white == 65535 else pixels.astype(np.uint8))
+    options = {"lossless": True} if path.suffix == ".webp" else {"quality": 95} if path.suffix == ".jpg" else {}
+    (picture if white == 65535 else picture.convert(kind)).save(path, **options)
+    return white
+
+
+@pytest.mark.parametrize(("name", "kind"), PICTURES)
+def test_heights_of_every_kind_of_picture(tmp_path, name, kind):
+    white = save_picture(tmp_path / name, kind)
+    heights = ce_gym.Terrain.from_file(tmp_path / name, CELL, height=HEIGHTS.max()).heights[1:-1, 1:-1]
+    error = 8 if name.endswith("jpg") else 1
+    np.testing.assert_allclose(heights, HEIGHTS, atol=error * HEIGHTS.max() / white)
+
+
+@pytest.mark.parametrize("kind", ["f4", "i4"])
+def test_pictures_without_white_are_refused(tmp_path, kind):
+    image = pytest.importorskip("PIL.Image")
+    image.fromarray((1e6 * HEIGHTS).astype(kind)).save(tmp_path / "hill.tif")
+    with pytest.raises(ValueError, match=r"hill.tif: pixels of kind .* have no white; expected 1, 8 or 16 bits"):
+        ce_gym.Terrain.from_file(tmp_path / "hill.tif", CELL)
+
+
+def test_damaged_maps_are_maps_or_one_line(tmp_path, file):
+    """Bytes of pictures and arrays changed, cut and moved at random."""
+    rng = random.Random(0)
+    sources = [Path(file)]
+    for number, (name, kind) in enumerate(PICTURES):
+        sources.append((tmp_path / f"{number}_{name}").absolute())
+        save_picture(sources[-1], kind)
+    for source in sources * 8:
+        data = bytearray(source.read_bytes())
+        for _ in range(rng.choice((1, 2, 5, 40))):
+            place = rng.randrange(min(len(data), rng.choice((40, 200, 10**6))))
+            data[place] = rng.randrange(256)
+        damaged = tmp_path / f"damaged{rng.choice([source.suffix, '.npy', '.png'])}"
+        damaged.write_bytes(data[: rng.choice((len(data), rng.randrange(len(data))))])
+        error, field = "", None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Pillow
+            try:
+                field = ce_gym.Terrain.from_file(damaged, CELL)
+            except ValueError as refusal:
+                error = str(refusal)
+        assert "\n" not in error
+        assert np.isfinite(field.heights).all() if field else "expected" in error
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ce_gym.Terrain.rough(0, 0.1, size=1e300), r"size=1e\+300, cell=0.1 needs inf GiB of memory"),
+        (lambda: ce_gym.Terrain.rough(0, 0.1, cell=1e-9), "cell=1e-09 needs .* GiB of memory; expected at most"),
+        (lambda: ce_gym.Terrain.rough(0, 1e308), "expected a length from 0 to 10000 m"),
+        (lambda: ce_gym.Terrain.rough(-1, 0.1), "seed=-1; expected a whole number, at least 0"),
+        (lambda: ce_gym.Terrain.stairs(0.1, 0.3, 10**12), "count=1000000000000 needs"),
+        (lambda: ce_gym.Terrain.stairs(0.1, 0.3, 2.5), r"count=2.5; expected a whole number"),
+        (lambda: ce_gym.Terrain(np.zeros((3, 3)) + 1j, 1.0), "heights='complex128'; expected an array of real numbers"),
+        (lambda: make_program(TRIPOD, "velocity", terrain={"kind": "slope", "levels": 10**400}), "levels"),
+        (
+            lambda: make_program(TRIPOD, "velocity", terrain={"kind": "slope", "levels": 10**12}),
+            "terrain has .* heights",
+        ),
+        (lambda: make_program(TRIPOD, "velocity", history=10**9), "history=1000000000; expected a whole number"),
+        (lambda: ce_gym.Simulator(ce_gym.Model(TRIPOD), 10**30), "num_envs=1000000000000000000000000000000 needs"),
+        (lambda: ce_gym.Simulator(ce_gym.Model(TRIPOD), 10**10), "num_envs=10000000000 needs .* GiB of memory"),
+    ],
+)
+def test_sizes_are_estimated_before_memory_is_taken(make, words):
+    with pytest.raises(ValueError, match=words):
+        make()
 
 
 @pytest.mark.slow

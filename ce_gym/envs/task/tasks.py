@@ -82,7 +82,7 @@ class Task(SceneOptions):
     metrics: Terms = option(terms)
     critic: Terms = option(terms, ())
     noise: Mapping[str, float] = option(magnitudes(), {}, merges=True)
-    history: int = option(whole(1), 1)
+    history: int = option(whole(1, 1000), 1)
     actions: Actions | Mapping[str, Actions] = option(action_kinds(get_args(Actions)), "joint_pd")
     action_scale: float = option(positive(), 0.5)
     action_joints: tuple[str, ...] = option(list_of_names, ("*",))

@@ -111,9 +111,10 @@ def make_field(terrain: Mapping[str, Any]) -> Terrain:
         ValueError: The field has more heights than a kernel supports.
     """
     levels, columns, size, cell = (terrain[name] for name in ("levels", "columns", "size", "cell"))
-    x, y = (cell * np.arange(math.ceil(round(n * size / cell, 6)) + 1) for n in (levels, columns))
-    if len(x) * len(y) > MOST_HEIGHTS:
-        raise ValueError(f"terrain has {len(x) * len(y)} heights; expected at most {MOST_HEIGHTS}, so a longer `cell`")
+    rows, row = (math.ceil(round(n * size / cell, 6)) + 1 for n in (levels, columns))
+    if rows * row > MOST_HEIGHTS:
+        raise ValueError(f"terrain has {rows * row} heights; expected at most {MOST_HEIGHTS}, so a longer `cell`")
+    x, y = cell * np.arange(rows), cell * np.arange(row)
     level, column = np.minimum(x // size, levels - 1)[:, None], np.minimum(y // size, columns - 1)[None, :].astype(int)
     offset = np.broadcast_arrays(x[:, None] - (level + 0.5) * size, y[None, :] - (column + 0.5) * size)
     difficulty = level / (levels - 1) * np.ones_like(column)

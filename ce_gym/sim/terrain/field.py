@@ -9,8 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ce_gym.model.arguments import check, is_number
+from ce_gym.compile.system import check_memory
+from ce_gym.model.arguments import check, check_whole, is_number
 from ce_gym.sim.terrain.files import read_heights
+
+HIGHEST = 1e4
+"""Largest height of random ground and of a step [m]."""
+BYTES = 40.0
+"""Memory for each height while a field is made, with its coordinates and copies [bytes]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +50,8 @@ class Terrain:
     origin: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        kind = np.asarray(self.heights).dtype
+        check("heights", kind.name, kind.kind in "fiu", "an array of real numbers")
         heights = np.array(self.heights, dtype=float, order="C")
         if heights.ndim != 2 or min(heights.shape) < 3:
             raise ValueError(f"heights has shape {heights.shape}; expected (rows, columns), 3 or more of each")
@@ -89,7 +97,13 @@ class Terrain:
             cell: Distance of the heights [m].
             size: Side of the square [m].
         """
-        check("amplitude", amplitude, _finite(amplitude) and amplitude >= 0, "a length from 0 m on")
+        check_whole("seed", seed, 0)
+        check(
+            "amplitude",
+            amplitude,
+            is_number(amplitude) and 0 <= amplitude <= HIGHEST,
+            f"a length from 0 to {HIGHEST:g} m",
+        )
         draw = np.random.default_rng(seed).uniform
         return cls.from_function(lambda x, _: draw(-amplitude, amplitude, x.shape), cell, size)
 
@@ -104,11 +118,12 @@ class Terrain:
             start: Where the first step rises [m].
             cell: Distance of the heights [m]; a step rises over a length of two.
         """
-        check("rise", rise, _finite(rise), "a finite height")
-        check("count", count, count >= 1, "at least 1")
+        check("rise", rise, is_number(rise) and abs(rise) <= HIGHEST, f"a height, at most {HIGHEST:g} m in size")
+        check_whole("count", count, 1)
         check("start", start, _finite(start), "a finite place")
         check("cell", cell, _positive(cell), "a length above 0 m")
         check("tread", tread, _finite(tread) and tread >= 2 * cell, "at least two cells")
+        check_memory(f"count={count}", BYTES * 3.0 * count * (tread / cell))
         # Half a cell off, so that the first step rises about its place.
         rows = np.arange(-2, np.ceil((count - 1) * tread / cell) + 3)
         heights = rise * np.clip(np.floor((rows + 0.5) * cell / tread) + 1, 0, count)
@@ -132,6 +147,7 @@ class Terrain:
         """
         check("cell", cell, _positive(cell), "a length above 0 m")
         check("size", size, _finite(size) and size >= 2 * cell, "at least two cells")
+        check_memory(f"size={size:g}, cell={cell:g}", BYTES * (float(size) / cell) * (float(size) / cell))
         half = round(size / cell) / 2 * cell
         along = np.linspace(-half, half, round(size / cell) + 1)
         x, y = np.meshgrid(centre[0] + along, centre[1] + along, indexing="ij")
