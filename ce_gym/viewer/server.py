@@ -3,16 +3,18 @@
 meshcat's own server is not used: it listens on every network interface and runs as another process.
 
 Only browsers on this machine that know the address can read the page. The address has a random part, which pages of
-other sites cannot guess, and requests with another host name are refused.
+other sites cannot guess. Requests with another host name, or from a page of another origin, are refused.
 """
 
 from __future__ import annotations
 
 import contextlib
+import re
 import secrets
 import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -22,6 +24,7 @@ LOOPBACK = "127.0.0.1"
 MOST_CLIENTS = 16  # connections at a time, each with a thread; further ones are closed
 PATIENCE = 10.0  # a connection without traffic is closed after this time [s]
 MOST_BYTES = 1 << 14  # of a message from a page
+MOST_MESSAGES = 500  # per second
 
 Events = Callable[[], Iterator[bytes]]
 Receive = Callable[[bytes], None]
@@ -74,6 +77,15 @@ class _Server(ThreadingHTTPServer):
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
         self._places = threading.BoundedSemaphore(MOST_CLIENTS)
+        self._lock, self._second, self._count = threading.Lock(), 0, 0
+
+    def may_post(self) -> bool:
+        """Return whether another message is allowed in this second."""
+        with self._lock:
+            second = int(time.monotonic())
+            self._count = self._count + 1 if second == self._second else 1
+            self._second = second
+            return self._count <= MOST_MESSAGES
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Start a thread for a connection, or close the connection if there are too many."""
@@ -101,7 +113,7 @@ def _handler(body: bytes, path: str, events: Events | None, receive: Receive | N
         timeout = PATIENCE
 
         def do_GET(self) -> None:
-            if not self._has_loopback_host():
+            if self._is_foreign():
                 self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             elif self.path == f"{path}events" and events is not None:
                 self._send_events(events())
@@ -113,12 +125,15 @@ def _handler(body: bytes, path: str, events: Events | None, receive: Receive | N
 
         def do_POST(self) -> None:
             length = self.headers.get("Content-Length", "")
-            if not self._has_loopback_host():
+            server: Any = self.server
+            if self._is_foreign():
                 self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             elif self.path != f"{path}messages" or receive is None:
                 self.send_error(HTTPStatus.NOT_FOUND)
-            elif not length.isdecimal() or int(length) > MOST_BYTES:
+            elif not re.fullmatch("[0-9]{1,9}", length) or int(length) > MOST_BYTES:
                 self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+            elif not server.may_post():
+                self.send_error(HTTPStatus.TOO_MANY_REQUESTS)
             else:
                 try:
                     receive(self.rfile.read(int(length)))
@@ -128,10 +143,12 @@ def _handler(body: bytes, path: str, events: Events | None, receive: Receive | N
                 self.send_response(HTTPStatus.NO_CONTENT)
                 self.end_headers()
 
-        def _has_loopback_host(self) -> bool:
+        def _is_foreign(self) -> bool:
+            """Return whether the request names another host, or comes from a page of another origin."""
             server: Any = self.server
-            port = server.server_port
-            return self.headers.get("Host") in (f"{LOOPBACK}:{port}", f"localhost:{port}")
+            host, origins = self.headers.get("Host"), self.headers.get_all("Origin", [])
+            ours = host in (f"{LOOPBACK}:{server.server_port}", f"localhost:{server.server_port}")
+            return not ours or any(origin != f"http://{host}" for origin in origins)
 
         def _send_head(self, kind: str, length: int | None = None) -> None:
             self.send_response(HTTPStatus.OK)

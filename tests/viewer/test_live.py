@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -208,6 +209,9 @@ INVALID = [
     {"do": "pause", "on": 1}, {"do": "speed", "speed": 0}, {"do": "speed", "speed": "1"},
     {"do": "look_back", "seconds": float("inf")}, {"do": "drag", "body": "x", "point": [0, 0, 0]},
     {"do": "figure", "name": "ratio", "value": 1.0}, {"do": "figure", "name": "friction", "value": -1},
+    {"do": "figure", "name": "friction", "value": 9.0}, {"do": "figure", "name": [], "value": 1.0},
+    {"do": "figure", "name": {}, "value": 1.0}, {"do": "drive", "shares": [10**400, 0, 0]}, {"do": "throw", "up": 1},
+    {"do": "drag", "body": [], "point": [0, 0, 0], "target": [0, 0, 0]}, {"do": "pause", "on": None},
     b"", b"{", b"[]", b"\xff", b"[" * 100_000,
 ]  # fmt: skip
 
@@ -268,9 +272,12 @@ def test_a_choice_goes_on_from_where_the_robot_is(runner: Runner):
 
 
 def test_a_choice_that_fails_leaves_what_is_there(runner: Runner):
-    for message in ({"policy": "../secret"}, {"terrain": "lava"}, {"shape": "x"}):
-        with pytest.raises(ValueError, match="expected one of"):
+    for message in ({"policy": "../secret"}, {"terrain": "lava"}, {"shape": "x"}, {"terrain": []}, {"ghost": {}}):
+        with pytest.raises(ValueError, match=r"expected (one of|'')|expected 'flat'"):
             runner.receive(json.dumps({"do": "choose", **message}).encode())
+    for message in ({}, {"on": 1}, {"on": True, "folder": "/"}):
+        with pytest.raises(ValueError, match="expected"):
+            runner.receive(json.dumps({"do": "record", **message}).encode())
     robots = runner.session.robots
     runner._prepare_robots({"policy": "no such policy"})
     settle(runner)
@@ -289,3 +296,45 @@ def test_what_is_recorded_becomes_a_page_and_rollouts(runner: Runner):
     assert "MeshCat" in page.read_text(encoding="utf-8")
     rollout = Rollout.load(page.with_name(f"{page.stem}_exact.npz"))
     assert np.array_equal(rollout.q[-1], np.float32(runner.session.robots[0].state()[0]))
+
+
+def random_value(rng: random.Random, depth: int = 0) -> Any:
+    """Return a value that JSON can express."""
+    numbers = [0, 1, -1, 0.5, 1e308, 10**400, -(10**30), float("nan"), float("inf"), True, False, None]
+    texts = ["", "x", "trunk", "exact", "flat", "friction", "\x1b[2J", "\n", "'" * 3, "/", "..", "ä" * 500]
+    kind = rng.random()
+    if kind < 0.3 and depth < 3:
+        return [random_value(rng, depth + 1) for _ in range(rng.choice((0, 1, 3, 3, 3, 4)))]
+    if kind < 0.4 and depth < 3:
+        return {rng.choice(texts): random_value(rng, depth + 1) for _ in range(rng.randrange(3))}
+    return rng.choice(numbers if kind < 0.8 else texts)
+
+
+def test_random_messages_are_carried_out_or_refused_in_one_line(runner: Runner):
+    rng = random.Random(0)
+    names = [*REQUESTS, "choose", "record", "explode"]
+    entries = ["shares", "on", "speed", "seconds", "body", "point", "target", "name", "value", "ghost", "terrain", "x"]
+    good: dict[str, Any] = {"shares": [1, 0, 0], "on": False, "speed": 1, "seconds": 0.1, "body": "trunk", "value": 0.5}
+    good |= {"point": [0, 0, 0], "target": [0, 0, 1], "name": "friction", "ghost": "", "terrain": "flat"}
+    carried_out = 0
+    for _ in range(600):
+        message = {"do": rng.choice(names)}
+        known = list(REQUESTS[message["do"]][1]) if message["do"] in REQUESTS else entries
+        for name in known if rng.random() < 0.8 else rng.sample(entries, 3):
+            message[name] = good.get(name) if rng.random() < 0.7 else random_value(rng)
+        body = bytearray(json.dumps(message).encode())
+        if rng.random() < 0.2:
+            body[rng.randrange(len(body))] = rng.randrange(256)
+        refusal = ""
+        try:
+            runner.receive(bytes(body))
+        except ValueError as error:
+            refusal = str(error)
+        carried_out += not refusal
+        assert "\n" not in refusal
+        if message["do"] == "choose":
+            runner._requests = type(runner._requests)()  # without compilations
+        runner.process_requests()
+        runner.session.advance(0.02)
+        assert all(np.isfinite(pose).all() for pose in runner.session.poses())
+    assert carried_out > 100

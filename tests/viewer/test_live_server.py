@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ce_gym.viewer.server import MOST_CLIENTS, PageServer
+from ce_gym.viewer.server import MOST_BYTES, MOST_CLIENTS, MOST_MESSAGES, PageServer
 from ce_gym.viewer.stream import Feed
 
 
@@ -53,6 +53,46 @@ def test_other_names_for_this_machine_are_refused(server: PageServer, host: str)
     """A name that an attacker lets point here would make our page part of his site."""
     assert ask(server, host=host) == 421
     assert ask(server, "events", host=host) == 421
+
+
+def post(server: PageServer, body: bytes, **headers: str) -> int:
+    """Status of the answer to a message."""
+    where = urllib.parse.urlsplit(urllib.parse.urljoin(server.url, "messages"))
+    with closing(http.client.HTTPConnection("127.0.0.1", where.port or 0, timeout=60)) as connection:
+        connection.putrequest("POST", where.path, skip_host=True)
+        sent = {"Host": where.netloc, "Content-Length": str(len(body))} | headers
+        for name, value in sent.items():
+            connection.putheader(name, value)
+        connection.endheaders(body)
+        return connection.getresponse().status
+
+
+def test_messages_from_pages_of_other_origins_are_refused() -> None:
+    received: list[bytes] = []
+    with closing(PageServer("", receive=received.append)) as server:
+        ours = "http://" + urllib.parse.urlsplit(server.url).netloc
+        assert post(server, b"{}") == post(server, b"{}", Origin=ours) == 204
+        for origin in ("http://evil.example", "null", ours.replace("http", "https"), ours + "0", ""):
+            assert post(server, b"{}", Origin=origin) == 421
+    assert len(received) == 2
+
+
+def test_length_and_rate_of_messages_are_limited() -> None:
+    received: list[bytes] = []
+    with closing(PageServer("", receive=received.append)) as server:
+        for length in ("9" * 5000, "-1", "", "1e3", "\u0662".encode().decode("latin-1"), str(MOST_BYTES + 1)):
+            assert post(server, b"", **{"Content-Length": length}) == 413
+        where = urllib.parse.urlsplit(urllib.parse.urljoin(server.url, "messages"))
+        with closing(http.client.HTTPConnection("127.0.0.1", where.port or 0, timeout=60)) as connection:
+            statuses = set()
+            for _ in range(20 * MOST_MESSAGES):
+                connection.request("POST", where.path, b"{}", {"Host": where.netloc})
+                answer = connection.getresponse()
+                answer.read()
+                statuses.add(answer.status)
+                if answer.status == 429:
+                    break
+    assert statuses == {204, 429}
 
 
 def test_clients_are_limited_in_number(server: PageServer) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from ce_gym.model.arguments import check, is_number
+from ce_gym.model.options import Check, flag, number, one_of
 from ce_gym.viewer.live.robot import RANGES
 from ce_gym.viewer.live.session import Session
 
@@ -14,7 +15,6 @@ MOST_SPEED = 4.0
 
 Message = Mapping[str, Any]
 Request = Callable[[Session], None]
-Reader = Callable[[Message], Any]
 
 
 def request_of(message: Message) -> Request:
@@ -23,15 +23,27 @@ def request_of(message: Message) -> Request:
     Raises:
         ValueError: The message is not a valid request.
     """
-    name = message.get("do")
-    if not isinstance(name, str) or name not in REQUESTS:
-        raise ValueError(f"do={name!r}; expected one of {', '.join(REQUESTS)}")
-    method, readers = REQUESTS[name]
-    try:
-        values = [read(message) for read in readers]
-    except KeyError as missing:
-        raise ValueError(f"do={name!r}: {missing} is missing") from None
-    return lambda session: method(session, *values)
+    change, checks = REQUESTS[one_of(REQUESTS)("do", message.get("do"))]
+    values = checked(message, checks)
+    if missing := [name for name in checks if name not in values]:
+        raise ValueError(f"do={message['do']!r}: {missing[0]!r} is missing")
+    if message["do"] == "figure":
+        number(*RANGES[values["name"]])("value", values["value"])
+    return lambda session: change(session, **values)
+
+
+def checked(message: Message, checks: Mapping[str, Check]) -> dict[str, Any]:
+    """Return the entries of a message beside `do`, each after its check.
+
+    Raises:
+        ValueError: An entry is unknown or has a wrong value.
+    """
+    values = {}
+    for name, value in message.items():
+        if name != "do":
+            check("entry", name, name in checks, f"one of {', '.join(checks) or 'none'}")
+            values[name] = checks[name](name, value)
+    return values
 
 
 def parsed(body: bytes) -> dict[str, Any]:
@@ -49,54 +61,33 @@ def parsed(body: bytes) -> dict[str, Any]:
     return message
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _vector(name: str, value: Any) -> list[float]:
+    valid = isinstance(value, list) and len(value) == 3 and all(is_number(x) and abs(x) < 1e6 for x in value)
+    check(name, value, valid, "three numbers")
+    return [float(x) for x in value]
 
 
-def _number(name: str, low: float, high: float) -> Reader:
-    def read(message: Message) -> float:
-        value = message[name]
-        if not _is_number(value) or not low <= value <= high:
-            raise ValueError(f"{name}={value!r}; expected a number from {low:g} to {high:g}")
-        return float(value)
-
-    return read
+def _text(name: str, value: Any) -> str:
+    check(name, value, isinstance(value, str), "a name")
+    return value
 
 
-def _vector(name: str) -> Reader:
-    def read(message: Message) -> list[float]:
-        value = message[name]
-        if not isinstance(value, list) or len(value) != 3 or not all(_is_number(x) and abs(x) < 1e6 for x in value):
-            raise ValueError(f"{name}={value!r}; expected three numbers")
-        return [float(x) for x in value]
-
-    return read
+def _set_figure(session: Session, name: str, value: float) -> None:
+    session.set_figures({name: value})
 
 
-def _on(message: Message) -> bool:
-    if not isinstance(on := message["on"], bool):
-        raise ValueError(f"on={on!r}; expected true or false")
-    return on
-
-
-def _figure(message: Message) -> dict[str, float]:
-    if (name := message["name"]) not in RANGES:
-        raise ValueError(f"name={name!r}; expected one of {', '.join(RANGES)}")
-    return {name: _number("value", *RANGES[name])(message)}
-
-
-REQUESTS: Mapping[str, tuple[Callable[..., None], tuple[Reader, ...]]] = {
-    "drive": (Session.drive, (_vector("shares"),)),
-    "pause": (Session.pause, (_on,)),
-    "speed": (Session.set_speed, (_number("speed", 0.01, MOST_SPEED),)),
-    "step": (Session.step_once, ()),
-    "look_back": (Session.look_back, (_number("seconds", 0.0, 1e4),)),
-    "drag": (Session.drag, (lambda message: message["body"], _vector("point"), _vector("target"))),
-    "release": (Session.release, ()),
-    "throw": (Session.throw, ()),
-    "drop": (Session.drop, ()),
-    "reset": (Session.reset, ()),
-    "align": (Session.align_ghost, ()),
-    "figure": (Session.set_figures, (_figure,)),
+REQUESTS: Mapping[str, tuple[Callable[..., None], Mapping[str, Check]]] = {
+    "drive": (Session.drive, {"shares": _vector}),
+    "pause": (Session.pause, {"on": flag}),
+    "speed": (Session.set_speed, {"speed": number(0.01, MOST_SPEED)}),
+    "step": (Session.step_once, {}),
+    "look_back": (Session.look_back, {"seconds": number(0.0, 1e4)}),
+    "drag": (Session.drag, {"body": _text, "point": _vector, "target": _vector}),
+    "release": (Session.release, {}),
+    "throw": (Session.throw, {}),
+    "drop": (Session.drop, {}),
+    "reset": (Session.reset, {}),
+    "align": (Session.align_ghost, {}),
+    "figure": (_set_figure, {"name": one_of(RANGES), "value": number(0.0)}),
 }
-"""The method of `Session` and the readers of its arguments, by the name of a request."""
+"""The change of a session and the checks of its arguments, by the name of a request."""

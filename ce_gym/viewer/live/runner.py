@@ -10,7 +10,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ce_gym.viewer.live.messages import parsed, request_of
+from ce_gym.model.options import flag, one_of
+from ce_gym.viewer.live.messages import checked, parsed, request_of
 from ce_gym.viewer.live.robot import RANGES, LiveRobot
 from ce_gym.viewer.live.session import Session
 from ce_gym.viewer.live.setup import GROUNDS, LEVELS, Setup, policies_for
@@ -20,6 +21,7 @@ from ce_gym.viewer.stream import LivePage
 
 RATE = 60.0  # of messages to the page [1/s]
 LATEST = 0.1  # longer delays are skipped [s]
+MOST_RECORDINGS = 100
 
 
 class Runner(LivePage):
@@ -44,6 +46,7 @@ class Runner(LivePage):
         self.scene = MovingScene(robot.model, robot.model.standing_q, 2, robot.terrain, robot.scan)
         self._requests: queue.SimpleQueue[Callable[[Session], None]] = queue.SimpleQueue()
         self._rate, self._last = 1.0, time.monotonic()
+        self._recordings = 0
 
     def html(self) -> str:
         """Return the live page."""
@@ -81,18 +84,15 @@ class Runner(LivePage):
         if message.get("do") == "choose":
             self._requests.put(self._choice(message))
         elif message.get("do") == "record":
-            self._requests.put(self._start_recording if message.get("on") is True else self._write_recording)
+            on = flag("on", checked(message, {"on": flag}).get("on"))
+            self._requests.put(self._start_recording if on else self._write_recording)
         else:
             self._requests.put(request_of(message))
 
     def _choice(self, message: dict[str, Any]) -> Callable[[Session], None]:
         """Return the request for another policy, level, ghost or ground."""
-        allowed = {"policy": ["", *self.offered], "transmission": LEVELS, "ghost": ("", *LEVELS), "terrain": GROUNDS}
-        changes = {name: value for name, value in message.items() if name != "do"}
-        for name, value in changes.items():
-            if name not in allowed or value not in allowed[name]:
-                expected = ", ".join(map(repr, allowed.get(name, allowed)))
-                raise ValueError(f"{name}={value!r}; expected one of {expected}")
+        choices = {"policy": ["", *self.offered], "transmission": LEVELS, "ghost": ("", *LEVELS), "terrain": GROUNDS}
+        changes = checked(message, {name: one_of(known) for name, known in choices.items()})
         return lambda _: self._prepare_robots(changes)
 
     def _prepare_robots(self, changes: dict[str, str]) -> None:
@@ -116,10 +116,14 @@ class Runner(LivePage):
             robot.close()
 
     def _start_recording(self, session: Session) -> None:
-        session.record(True)
+        if self._recordings < MOST_RECORDINGS:
+            session.record(True)
+        else:
+            self.notice = f"{MOST_RECORDINGS} recordings are written; start the page again for more"
 
     def _write_recording(self, session: Session) -> None:
         recording = session.record(False)
+        self._recordings += recording is not None
 
         def write() -> None:
             try:
