@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     from ce_gym.identify.log import read_log
     from ce_gym.identify.page import page
     from ce_gym.identify.yaml_output import check_base, report, to_yaml
-    from ce_gym.model import load_robot
+    from ce_gym.model import RobotError, load_robot
 
     if args.simulate is not None:
         check_output(args.log, LOG)
@@ -79,16 +79,21 @@ def run(args: argparse.Namespace) -> int:
     out, html = args.out or args.log.with_suffix(".yaml"), args.html or args.log.with_suffix(".html")
     for file, kind in ((out, ESTIMATES), (html, PAGE)):
         check_output(file, kind)
-    result = identify(
-        args.robot,
-        log,
-        control=args.control,
-        transmission=args.transmission,
-        kinds=args.parameters,
-        fixed=args.fix,
-        window=args.window,
-        substep=args.substep,
-    )
+    try:
+        result = identify(
+            args.robot,
+            log,
+            control=args.control,
+            transmission=args.transmission,
+            kinds=args.parameters,
+            fixed=args.fix,
+            window=args.window,
+            substep=args.substep,
+        )
+    except (ValueError, ArithmeticError, MemoryError) as error:  # a fit that fails, in NumPy or SciPy
+        if isinstance(error, RobotError):
+            raise
+        raise RobotError(f"{args.log}: identification failed: {' '.join(str(error).split())[:200]}") from error
     print(report(result))
     base = args.robot
     if base.endswith((".yaml", ".yml")):

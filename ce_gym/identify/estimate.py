@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,6 +38,16 @@ from ce_gym.model.errors import file_error, unknown_name
 Array = NDArray[np.float64]
 LARGEST_ANGLE = 12.6
 """Largest angle of a joint [rad], two turns: larger numbers are degrees."""
+LARGEST_SPEED = 300.0
+"""Largest speed of a joint [rad/s]."""
+OVER = 100.0
+"""Largest commanded torque of a joint over its largest torque; motors may be commanded more than they give."""
+UNITS = {
+    "angle": "radians or metres, not degrees",
+    "speed": "rad/s or m/s, not degrees or turns",
+    "torque": "N m or N, not a thousandth of them",
+}
+"""Unit of each kind of column of a joint, and units that are mistaken for it."""
 RESTARTS, GAIN = 4, 1e-4
 """Largest number of restarts of initial states, and the relative gain that makes another one worthwhile."""
 LARGEST_RESIDUAL = 2.0
@@ -85,6 +96,7 @@ def identify(
     described = robot if isinstance(robot, Robot) else load_robot(robot)
     log = log.of_links(described.links_by_joint)
     _check_names(described, log)
+    _check_units(described, log, control)
     model = base_fixed_model(described, [*log.commanded, *(name for _, name in log.measured)], transmission)
     kinds = kinds or default_kinds(model.robot, log.measured)
     parameters = select_parameters(model.robot, kinds, fixed, longest_delay, log.measured)
@@ -194,18 +206,29 @@ def _residual_warnings(log: Log, noise: Array) -> list[str]:
 
 
 def _check_names(robot: Robot, log: Log) -> None:
-    """Check that the robot has all names in a log, that angles of joints are in radians, and that the robot moves."""
+    """Check that the robot has all names in a log, and that the robot moves."""
     names = tuple(body.name for body in robot.bodies)
-    rotors = {rotor.name for rotor in robot.rotors()}
     for name in (*log.commanded, *(name for _, name in log.measured)):
         if name not in names:
             raise unknown_name(str(log.source), "column", name, names, "a joint or a rotor")
-    for (kind, name), column in zip(log.measured, log.values.T, strict=True):
-        if kind == "angle" and name not in rotors and (largest := np.abs(column).max()) > LARGEST_ANGLE:
-            expected = f"radians, {LARGEST_ANGLE:g} at most"
-            raise file_error(log.source, f"angle:{name}: up to {largest:.4g}", expected, LogError)
     if not np.ptp(log.values, axis=0).any():
         raise file_error(log.source, "all measurements are constant", "a robot that moves", LogError)
+
+
+def _check_units(robot: Robot, log: Log, control: str) -> None:
+    """Check the units of the columns of joints by the sizes of their numbers; rotors may turn far and fast."""
+    rotors = {rotor.name for rotor in robot.rotors()}
+    commanded = "torque" if control.endswith("torque") else "angle"
+    columns = [("command", commanded, name) for name in log.commanded]
+    columns += [(kind, kind, name) for kind, name in log.measured]
+    for (column, kind, name), values in zip(columns, np.hstack([log.commands, log.values]).T, strict=True):
+        if name in rotors:
+            continue
+        torque = OVER * (robot.body(name).joint.torque or math.inf)
+        most = {"angle": LARGEST_ANGLE, "speed": LARGEST_SPEED, "torque": torque}[kind]
+        if (largest := np.abs(values).max()) > most:
+            expected = f"{UNITS[kind]}, {most:g} at most"
+            raise file_error(log.source, f"{column}:{name}: up to {largest:.4g}", expected, LogError)
 
 
 def _sort_commands(model: Model, log: Log, control: str) -> Log:

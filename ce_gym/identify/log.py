@@ -26,6 +26,12 @@ Array = NDArray[np.float64]
 KINDS = ("command", "angle", "speed", "torque")
 LARGEST_LOG = 2**30
 """Largest log [bytes]."""
+SHORTEST_STEP, LONGEST_STEP = 1e-5, 0.1
+"""Bounds of the time between rows [s]."""
+USUAL = (1e-4, 0.1)
+"""Time between rows by which the unit of other times is guessed [s]."""
+UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9, "minutes": 60.0}
+"""Other units of time [s]."""
 JITTER = 0.1
 """Largest deviation of the time between rows from its median, relative to the median."""
 
@@ -85,7 +91,10 @@ def read_log(path: str | os.PathLike[str]) -> Log:
     except RobotError as error:
         raise LogError(str(error)) from None
     rows = csv.reader(lines)
-    header = [cell.strip().lstrip("\ufeff") for cell in next(rows, [])]
+    try:
+        header = [cell.strip().lstrip("\ufeff") for cell in next(rows, [])]
+    except csv.Error as error:
+        raise file_error(file, f"row 1: {error}", "names of columns, separated by commas", LogError) from None
     kinds = _kinds(file, header)
     table = _numbers(file, header, rows)
     dt = _spacing(file, table[:, kinds.index(("time", ""))])
@@ -149,4 +158,8 @@ def _spacing(file: str, time: Array) -> float:
         k = int(wrong[0])
         expected = f"evenly spaced rows, {dt:.6g} s apart" if dt > 0 else "increasing times"
         raise file_error(file, f"row {k + 3}, column time is {time[k + 1]:.9g}", expected, LogError)
+    if not SHORTEST_STEP <= dt <= LONGEST_STEP:
+        guess = next((f", not in {unit}" for unit, one in UNITS.items() if USUAL[0] <= dt * one <= USUAL[1]), "")
+        expected = f"time in seconds{guess}, rows {SHORTEST_STEP:g} to {LONGEST_STEP:g} s apart"
+        raise file_error(file, f"column time has rows {dt:.6g} apart", expected, LogError)
     return float((time[-1] - time[0]) / len(steps))

@@ -109,6 +109,11 @@ def test_a_log_is_read_as_it_was_saved(log: Log, tmp_path: Path):
 GOOD = "time,command:a,angle:a\n" + "".join(f"{k / 100},0,0\n" for k in range(120))
 
 
+def in_time(unit: float) -> str:
+    """A good log with another unit of time."""
+    return "time,command:a,angle:a\n" + "".join(f"{unit * k / 100},0,0\n" for k in range(120))
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -121,6 +126,11 @@ GOOD = "time,command:a,angle:a\n" + "".join(f"{k / 100},0,0\n" for k in range(12
         (GOOD.replace("0.5,0,0", "0.52,0,0"), r"row 52, column time is 0.52: expected evenly spaced rows"),
         (GOOD[: GOOD.index("0.5,0,0")], r"50 rows: expected at least 100"),
         ("", r"no column time"),
+        ("x" * 200_000, r"row 1: field larger than field limit .*: expected names of columns"),
+        (in_time(1e3), r"rows 10 apart: expected time in seconds, not in milliseconds, rows 1e-05 to 0.1 s apart"),
+        (in_time(1e6), r"rows 10000 apart: expected time in seconds, not in microseconds"),
+        (in_time(1e9), r"rows 1e\+07 apart: expected time in seconds, not in nanoseconds"),
+        (in_time(1e-6), r"rows 1e-08 apart: expected time in seconds, rows"),
     ],
 )
 def test_bad_logs_are_one_line(text: str, message: str, tmp_path: Path):
@@ -139,8 +149,27 @@ def test_logs_that_do_not_fit_the_robot(leg: Robot, log: Log):
         identify(leg, replace(log, measured=log.measured[:2], values=log.values[:, :2]))
     with pytest.raises(RobotError, match=r"column is 'HR_kneelink': .*did you mean 'HR_knee_link'"):
         identify(leg, replace(log, commanded=("HR_kneelink", *log.commanded[1:])))
-    with pytest.raises(LogError, match="expected radians"):
-        identify(leg, replace(log, values=np.degrees(log.values)))
+    fast = np.column_stack([log.values, 400.0 * np.ones(len(log.values))])
+    for changes, control, message in (
+        (
+            {"values": np.degrees(log.values)},
+            "position",
+            r"angle:HR_abad_link: up to .* radians or metres, not degrees",
+        ),
+        ({"commands": np.degrees(log.commands)}, "position", r"command:HR_abad_link: up to .* not degrees"),
+        (
+            {"commands": np.full_like(log.commands, 1e4)},
+            "torque",
+            r"command:HR_abad_link: .* N m or N, not a thousandth",
+        ),
+        (
+            {"measured": (*log.measured, ("speed", "HR_abad_link")), "values": fast},
+            "position",
+            r"speed:.* rad/s or m/s",
+        ),
+    ):
+        with pytest.raises(LogError, match=message):
+            identify(leg, replace(log, **changes), control=control)
     with pytest.raises(LogError, match="all measurements are constant: expected a robot that moves"):
         identify(leg, replace(log, values=0 * log.values))
     with pytest.raises(LogError, match="rows: expected at least"):
