@@ -5,6 +5,7 @@ One kernel computes the reverse mode of one sub-step: it repeats the iterations 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -95,6 +96,12 @@ class StepDerivatives:
         self._input_gradients = input_gradients(primal)
         self.state_sizes = {name: variable.size for name, variable in self._weight_variables.items()}
         self._other_sizes = {name: variable.size for name, variable in self._input_gradients.items()}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _copied, (self.simulator, self._keep_every, self._records)
+
+    def __copy__(self) -> StepDerivatives:
+        return copy.deepcopy(self)  # of the simulator and the record, too
 
     @property
     def n_recorded(self) -> int:
@@ -373,6 +380,14 @@ def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray
         parts.append(_Part(before, (updates[LEFT.name] < values[LEFT.name])[:, 0]))
         values |= updates | {variable.name: updates[step.tried[part].name] for part, variable in step.start.items()}
     return parts
+
+
+def _copied(simulator: Simulator, keep_every: int, records: list[Record]) -> StepDerivatives:
+    """Return derivatives of a simulator with records whose arrays a copy may have moved to unaligned memory."""
+    derivatives = StepDerivatives(simulator, keep_every)
+    aligned = [{name: aligned_copy(array) for name, array in record.arrays.items()} for record in records]
+    derivatives._records = [replace(record, arrays=arrays) for record, arrays in zip(records, aligned, strict=True)]
+    return derivatives
 
 
 def _overwrite(array: NDArray, rows: NDArray, chosen: NDArray[np.bool_]) -> None:

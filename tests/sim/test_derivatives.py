@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -359,3 +361,26 @@ def test_bad_arguments_are_named():
         derivatives.backward({"height": np.zeros(1)})
     with pytest.raises(ValueError, match=r"weights of 'q' have shape \(2,\); expected \(1, 2\)"):
         derivatives.backward({"q": np.zeros(2)})
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.copy, copy.deepcopy, lambda derivatives: pickle.loads(pickle.dumps(derivatives))],
+    ids=["copy", "deepcopy", "pickle"],
+)
+@pytest.mark.parametrize("keep_every", [1, 4])
+def test_a_copy_of_a_recorder_goes_on_by_itself(copied, keep_every: int):
+    sim, target = dropped(5)
+    recorders = [StepDerivatives(sim, keep_every=keep_every)]
+    recorders[0].step(target, 3)
+    recorders.append(copied(recorders[0]))
+    for recorder in recorders:
+        recorder.step(target, 2)
+        assert recorder.n_recorded == 5
+    v = recorders[0].simulator.v
+    np.testing.assert_array_equal(recorders[1].simulator.v, v)
+    (first, targets, _), (copied_first, copied_targets, _) = (each.backward({"v": v}) for each in recorders)
+    for name, gradient in first.items():
+        np.testing.assert_array_equal(copied_first[name], gradient, err_msg=name)
+    np.testing.assert_array_equal(copied_targets, targets)
+    assert np.abs(targets[0]).max() > 0
