@@ -178,7 +178,7 @@ def written(path: str | os.PathLike[str], kind: Kind) -> Iterator[Path]:
 def write_file(path: str | os.PathLike[str], content: bytes | str, kind: Kind) -> None:
     """Write a file as a whole; see `written`."""
     with written(path, kind) as temporary:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+        temporary.write_bytes(content.encode(errors="replace") if isinstance(content, str) else content)
 
 
 def write_whole(files: Mapping[Path, bytes]) -> None:

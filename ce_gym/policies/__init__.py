@@ -3,8 +3,8 @@
 from ce_gym.model.errors import listed_names
 from ce_gym.policies.actor import ACTIVATIONS, Actor, Policy
 from ce_gym.policies.arguments import add_env_arg, add_env_arguments, checked_arguments, parse_yaml
-from ce_gym.policies.environments import environment_of, import_module_of, registered
-from ce_gym.policies.errors import LevelWarning, PolicyError
+from ce_gym.policies.environments import environment_of, import_module_of, registered, warn_of_other_robot
+from ce_gym.policies.errors import LevelWarning, PolicyError, RobotWarning
 from ce_gym.policies.exports import export_policy
 from ce_gym.policies.files import load_policy, read_actor, write_npz
 from ce_gym.policies.height_maps import keep_map, with_map
@@ -22,6 +22,7 @@ __all__ = [
     "LevelWarning",
     "Policy",
     "PolicyError",
+    "RobotWarning",
     "add_env_arg",
     "add_env_arguments",
     "checked_arguments",
@@ -43,6 +44,7 @@ __all__ = [
     "save",
     "shelf",
     "shipped_policies",
+    "warn_of_other_robot",
     "with_map",
     "write_npz",
 ]

@@ -6,15 +6,20 @@ user's command line only. From a file it is accepted only if the module has been
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import sys
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import EnvSpec
 
-from ce_gym.policies.errors import PolicyError
+from ce_gym.model.errors import RobotError
+from ce_gym.model.load import load_robot
+from ce_gym.policies.errors import PolicyError, RobotWarning
+from ce_gym.policies.places import find_policy
 
 
 def environment_of(record: Mapping[str, Any], named: str | None = None) -> str:
@@ -28,6 +33,9 @@ def environment_of(record: Mapping[str, Any], named: str | None = None) -> str:
         PolicyError: If the record names an environment that is not registered, or that needs the import of a module.
     """
     if named:
+        with contextlib.suppress(gymnasium.error.Error, ImportError, RobotError):  # whoever makes it reports these
+            if robot := registered(named).kwargs.get("robot"):
+                warn_of_other_robot(record, load_robot(robot).name)
         return named
     env_id = record["env"]
     module, _, name = env_id.rpartition(":")
@@ -42,6 +50,17 @@ def environment_of(record: Mapping[str, Any], named: str | None = None) -> str:
             f"or the module that registers it: --env MODULE:{shown(name)}"
         )
     return env_id
+
+
+def warn_of_other_robot(record: Mapping[str, Any], robot: str) -> None:
+    """Warn if a policy was trained on a robot of another name.
+
+    Warns:
+        RobotWarning: The names differ.
+    """
+    trained = record.get("policy_spec", {}).get("robot", robot)
+    if trained != robot:
+        warnings.warn(f"trained on robot {shown(str(trained))!r}, used on {robot!r}", RobotWarning, stacklevel=3)
 
 
 def import_module_of(env_id: str) -> str:
@@ -68,7 +87,16 @@ def registered(env_id: str) -> EnvSpec:
         ModuleNotFoundError: If there is no such module.
         gymnasium.error.Error: If the environment is not registered.
     """
-    return gymnasium.spec(import_module_of(env_id))
+    name = import_module_of(env_id)
+    try:
+        return gymnasium.spec(name)
+    except gymnasium.error.Error:
+        example = "the id of an environment, such as ce_gym/MiniCheetahVelocity-v0"
+        if find_policy(name) is not None:
+            raise gymnasium.error.NameNotFound(f"{env_id}: is a policy; expected {example}") from None
+        if f"ce_gym/{name}" in gymnasium.registry:
+            raise gymnasium.error.NameNotFound(f"{env_id}: not registered; did you mean ce_gym/{name}?") from None
+        raise
 
 
 def shown(text: str) -> str:

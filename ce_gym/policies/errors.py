@@ -9,3 +9,7 @@ class PolicyError(ValueError):
 
 class LevelWarning(UserWarning):
     """A policy runs at another transmission level than in training."""
+
+
+class RobotWarning(UserWarning):
+    """A policy runs on another robot than in training."""

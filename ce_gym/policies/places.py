@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import zipfile
 from pathlib import Path
@@ -49,11 +50,22 @@ def locate_policy(path: str | Path) -> Path:
     """
     file = find_policy(path)
     if file is None:
-        known = shipped_policies()
-        close = difflib.get_close_matches(str(path), [*(name.removesuffix("_exact") for name in known), *known], n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"there are: {', '.join(known) or 'none yet'}"
-        raise PolicyError(f"{path}: no such policy; expected {WHERE} ({hint})")
+        raise PolicyError(f"{path}: {_no_policy(Path(path))}")
     return file
+
+
+def _no_policy(path: Path) -> str:
+    """Return why there is no policy at a path, and what to do."""
+    if is_file(path) and path.suffix == ".npz":
+        return f"is not a policy, perhaps a rollout, which `view` shows; expected {WHERE}"
+    with contextlib.suppress(OSError, ValueError):  # the system refuses some paths
+        runs = (file.parent for depth in ("*", "*/*") for file in path.glob(f"{depth}/policy.json"))
+        if run := next(runs, None):
+            return f"no such policy; expected a run in this folder, such as {run}; `transfer` takes all of them"
+    known = [*(name.removesuffix("_exact") for name in shipped_policies()), *shipped_policies()]
+    close = difflib.get_close_matches(path.name, known, n=1)
+    hint = f"did you mean {close[0]!r}?" if close else "`python -m ce_gym list` shows these names"
+    return f"no such policy; expected {WHERE} ({hint})"
 
 
 def policy_name(file: Path) -> str:

@@ -12,7 +12,7 @@ from point_mass import ID
 from toy import FAST
 
 from ce_gym.__main__ import _parser, main
-from ce_gym.policies import load_policy, write_npz
+from ce_gym.policies import RobotWarning, environment_of, load_policy, write_npz
 from ce_gym.policies.actor import Actor
 
 LEARNING = ("train", "evaluate", "transfer", "sim2sim", "export", "card")
@@ -80,6 +80,33 @@ def test_arguments_that_an_environment_does_not_take_are_one_line(tmp_path, caps
     record |= {"observation_size": 48, "action_size": 12, "activation": "Tanh", "policy_spec": {}}
     write_npz(Actor(layers, "Tanh"), record, tmp_path / "policy.npz")
     assert "num_envs" in one_line(["evaluate", str(tmp_path / "policy.npz")], capsys)
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["train", "mini_cheetah_velocity"], "mini_cheetah_velocity: is a policy; expected the id of an environment"),
+        (["train", "MiniCheetahVelocity-v0"], "did you mean ce_gym/MiniCheetahVelocity-v0?"),
+        (["evaluate", "study"], "study: no such policy; expected a run in this folder, such as study/seed_0"),
+        (["evaluate", "walk.npz"], "walk.npz: is not a policy, perhaps a rollout, which `view` shows"),
+        (["card", "mini_cheetah_velocity"], "is a policy of the package; expected --out FOLDER"),
+        (["train", "ce_gym/TelloVelocity-v0", "--algo", "distill"], "teacher: missing; expected --set teacher=POLICY"),
+        (["evaluate", "mini_cheetah_backflip", "--suites"], "--suites: ce_gym/MiniCheetahBackflip-v0 has no commanded"),
+        (["train", ID, "--out", ""], "argument --out: ''; expected a name"),
+    ],
+)
+def test_mistakes_have_the_right_advice(argv, words, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "study" / "seed_0").mkdir(parents=True)
+    (tmp_path / "study" / "seed_0" / "policy.json").touch()
+    np.savez(tmp_path / "walk.npz", header=np.zeros(1))
+    assert words in one_line(argv, capsys)
+
+
+def test_a_policy_of_another_robot_gives_a_warning():
+    record = {"env": "ce_gym/Go1Velocity-v0", "policy_spec": {"robot": "go1"}}
+    with pytest.warns(RobotWarning, match="trained on robot 'go1', used on 'mini_cheetah'"):
+        environment_of(record, "ce_gym/MiniCheetahVelocity-v0")
 
 
 def test_the_module_of_an_id_is_imported_and_recorded(tmp_path, monkeypatch):

@@ -107,7 +107,7 @@ def test_names_folders_and_files_are_policies(tmp_path: Path, monkeypatch: pytes
     np.savez(tmp_path / "rollout.npz", q=np.zeros(3))
     for name in ("dog", "dog_walk.npz", tmp_path / "rollout.npz", tmp_path):
         assert find_policy(name) is None
-    with pytest.raises(PolicyError, match=r"cat: no such policy; expected a file .* \(there are: dog_walk_exact\)"):
+    with pytest.raises(PolicyError, match=r"cat: no such policy; expected a file .* \(`python -m ce_gym list` shows"):
         locate_policy("cat")
     with pytest.raises(PolicyError, match=r"dog_wlak: no such policy; .* \(did you mean 'dog_walk'\?\)"):
         locate_policy("dog_wlak")

@@ -62,8 +62,9 @@ def command_ranges(policy: Policy, what: str) -> Array:
     Raises:
         PolicyError: If the task has no commands; the message begins with `what`.
     """
-    ranges = policy.record["policy_spec"].get("command", {}).get("range")
-    if ranges is None:
+    spec = policy.record["policy_spec"]
+    ranges, blocks = spec.get("command", {}).get("range"), spec.get("observation", {}).get("blocks")
+    if ranges is None or (blocks and not any("command" in block["name"] for block in blocks)):
         raise PolicyError(f"{what}: {policy.record['env']} has no commanded velocities; expected a task with them")
     return np.array(ranges)
 

@@ -19,6 +19,7 @@ from ce_gym.learn.evaluation.episodes import (
     UNDISTURBED,
     UNLIMITED,
     TrackingErrors,
+    command_ranges,
     open_environments,
     run_policy,
     weights_seed,
@@ -164,8 +165,7 @@ def compare(
     import ce_gym.export.mujoco_twin  # noqa: F401  # fails at the start if MuJoCo is missing
 
     record, results, missing = policy.record, {}, []
-    if not any("command" in block["name"] for block in record["policy_spec"]["observation"]["blocks"]):
-        raise PolicyError(f"sim2sim: {record['env']} has no commanded velocities; expected a task with them")
+    command_ranges(policy, "sim2sim")
     spec, trained = record["policy_spec"], record["transmission"]
     arguments = STEADY | {"noise": {block["name"]: 0.0 for block in spec["observation"]["blocks"]}}
     seed = weights_seed(policy) if seed is None else seed

@@ -26,7 +26,7 @@ from ce_gym.learn.runs.progress import geometric, linear
 from ce_gym.learn.runs.settings import CONFIG_FOLDER, CommonSettings
 from ce_gym.model.arguments import check
 from ce_gym.model.options import option
-from ce_gym.policies import Policy, PolicyError, load_policy
+from ce_gym.policies import Policy, PolicyError, load_policy, locate_policy, warn_of_other_robot
 
 F = np.float32
 
@@ -110,6 +110,7 @@ class Distiller(Learner):
         if not isinstance(envs.single_observation_space, gymnasium.spaces.Dict):
             raise PolicyError(f"{job.env_id}: obs_mode: expected dict, for the observation of the teacher")
         self.teacher = load_policy(s.teacher)
+        warn_of_other_robot(self.teacher.record, envs.unwrapped.model.robot.name)  # type: ignore[attr-defined]
         kwargs = {**job.env_kwargs, **s.training}
         self.columns = teacher_columns(self.teacher, s.teacher, envs.unwrapped, kwargs)
         taught = self.teacher.record["action_size"]
@@ -145,5 +146,12 @@ class Distiller(Learner):
 
 
 def train(job: Job) -> Trained:
-    """Train, and save the student even if Ctrl-C ends training early; see `run_learner`."""
+    """Train, and save the student even if Ctrl-C ends training early; see `run_learner`.
+
+    Raises:
+        PolicyError: If there is no such teacher, or the student cannot be trained with it.
+    """
+    if job.settings.teacher == "none":
+        raise PolicyError("teacher: missing; expected --set teacher=POLICY")
+    locate_policy(job.settings.teacher)
     return run_learner(Distiller, job)
