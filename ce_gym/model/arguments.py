@@ -38,7 +38,7 @@ def check_shape(argument: str, value: Any, *expected: tuple[int, ...]) -> None:
 def is_number(value: Any) -> bool:
     """Return whether a value is a finite number."""
     number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    return number and abs(value) <= sys.float_info.max  # a whole number may have hundreds of digits
+    return number and bool(abs(value) <= sys.float_info.max)  # a whole number may have hundreds of digits
 
 
 def is_whole(value: object) -> bool:
