@@ -24,7 +24,7 @@ from ce_gym.dynamics.quantities.configurations import neutral_positions, random_
 from ce_gym.dynamics.quantities.forces import inertial_parameters
 from ce_gym.dynamics.quantities.frames import frames_of
 from ce_gym.dynamics.standing import check_standing
-from ce_gym.model import Robot, load_robot
+from ce_gym.model import Robot, check_robot, load_robot
 from ce_gym.model.arguments import check_choice, check_whole
 from ce_gym.model.clusters import ClusterTree
 from ce_gym.model.coordinates import unit_quaternions
@@ -86,6 +86,8 @@ class Model:
         check_choice("dtype", dtype, ("float64", "float32"))
         check_whole("num_threads", num_threads, 1)
         described = robot if isinstance(robot, Robot) else load_robot(robot)
+        if described is robot:  # files have been checked
+            check_robot(described)
         self.transmission, self.dtype, self.num_threads = transmission, dtype, num_threads
         self.locked_rotors = locked_rotors
         self.eliminate_rotors = eliminate_rotors

@@ -20,6 +20,10 @@ from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import ContactMaterial, Robot
 from ce_gym.model.drives import ELASTIC_FACTORS, Elasticity, Motor
 from ce_gym.model.mechanism import EliminatedRotor, Mechanism, MovingBody, smallest_spin_factor, spin_inertia
+from ce_gym.model.ranges import FINITE, NOT_NEGATIVE, POSITIVE, TEMPERATURE
+
+RANGES = {"finite": FINITE, "positive": POSITIVE, "0 or more": NOT_NEGATIVE, "a temperature": TEMPERATURE}
+"""Allowed values by the word for them in `Parameter`."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Parameter:
     unit: str
     size: str
     default: Callable[[Robot, ContactMaterial], ArrayLike]
-    allowed: Literal["finite", "positive", "0 or more"] = "0 or more"
+    allowed: Literal["finite", "positive", "0 or more", "a temperature"] = "0 or more"
     owners: Callable[[Robot], Iterable[str]] | None = None
 
     @property
@@ -143,7 +147,12 @@ MODEL_PARAMETERS = (
     ),
     Parameter("cogging", "factor on the cogging of limited motors", "-", "1", unit_factor),
     Parameter(
-        "ambient", "temperature of the air around limited motors that grow warm", "deg C", "1", _ambient, "finite"
+        "ambient",
+        "temperature of the air around limited motors that grow warm",
+        "deg C",
+        "1",
+        _ambient,
+        "a temperature",
     ),
     Parameter(
         "battery_voltage",

@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 SMALLEST_EIGENVALUE = 1e-12
 """Smallest allowed eigenvalue of the mass matrix scaled to ones on its diagonal; below, accelerations are noise [-]."""
+LARGEST_CONDITION = 1e14
+"""Largest allowed condition number of the mass matrix; above, accelerations have less than two digits [-]."""
 DEEPEST_CONTACT = 0.01
 """Largest allowed depth of contacts below ground in the standing pose [m]."""
 FURTHEST_BEYOND = 0.01
@@ -85,6 +87,7 @@ def _check_mass_matrix(mechanism: Mechanism, M: Array, file: str) -> None:
     if np.isfinite(M).all():
         values, vectors = np.linalg.eigh(M / scale[:, None] / scale)
         if values[0] > SMALLEST_EIGENVALUE and (np.diag(M) > 0.0).all():
+            _check_condition(M, names, file)
             return
         moving = np.abs(vectors[:, 0])
     else:
@@ -94,6 +97,17 @@ def _check_mass_matrix(mechanism: Mechanism, M: Array, file: str) -> None:
         f"{file}: the mass matrix at the standing pose is not positive definite in {', '.join(list(joints)[:6])}: "
         f"expected mass or inertia that every motion of the joints moves, and gear ratios that leave it visible"
     )
+
+
+def _check_condition(M: Array, names: list[str], file: str) -> None:
+    values, vectors = np.linalg.eigh(M)
+    if not values[-1] <= LARGEST_CONDITION * values[0]:
+        light, heavy = (names[int(np.abs(vectors[:, i]).argmax())] for i in (0, -1))
+        raise RobotError(
+            f"{file}: the mass matrix at the standing pose has eigenvalues from {values[0]:.1e} ({light}) to "
+            f"{values[-1]:.1e} ({heavy}): expected a ratio of at most {LARGEST_CONDITION:g}; check the units "
+            f"of masses, inertias and gear ratios"
+        )
 
 
 def standing_pose(mechanism: Mechanism) -> Standing:

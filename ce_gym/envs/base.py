@@ -24,6 +24,7 @@ from ce_gym.envs.runtime.symmetry import Symmetry, left_right
 from ce_gym.model.arguments import check, check_choice
 from ce_gym.sim.batch import File, Snapshot
 from ce_gym.sim.devices import Array
+from ce_gym.sim.inputs import finite_array, real_array
 
 
 class BaseEnv(EzPickle):
@@ -95,9 +96,7 @@ class BaseEnv(EzPickle):
             gymnasium.error.ClosedEnvironmentError: After `close`.
         """
         batch = self.batch
-        rows, shapes = batch.place.rows(command, batch.dtype), ((3,), (batch.num_envs, 3))
-        if tuple(rows.shape) not in shapes or not np.isfinite(batch.place.host(rows)).all():
-            raise ValueError(f"command has shape {tuple(rows.shape)}; expected (3,) or {shapes[1]}, finite")
+        rows = finite_array("command", command, batch.dtype, (3,), (batch.num_envs, 3))
         with self._exclusive():
             batch.write("command", rows)
 
@@ -237,12 +236,7 @@ def checked_action(action: Any, shape: tuple[int, int]) -> NDArray[np.float32]:
     Raises:
         ValueError: The action is not an array of finite numbers of this shape.
     """
-    try:
-        rows = np.asarray(action)
-    except ValueError:  # lists of unequal lengths
-        rows = np.empty(0, object)
-    if rows.dtype.kind not in "fiu":
-        raise ValueError(f"action is {_brief(action)}; expected an array of real numbers, such as float32")
+    rows = real_array("action", action)
     if rows.shape not in ((shape, shape[1:]) if shape[0] == 1 else (shape,)):
         raise ValueError(f"action has shape {np.shape(action)}; expected {shape if shape[0] > 1 else shape[1:]}")
     if not np.isfinite(rows).all():
@@ -272,8 +266,3 @@ def check_options(options: Mapping[str, Any] | None, known: tuple[str, ...] = ()
     for name in options or ():
         if name not in known:
             raise ValueError(f"options[{name!r}] has no effect in reset; expected {' or '.join(known) or 'no options'}")
-
-
-def _brief(value: Any) -> str:
-    kind = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a {type(value).__name__}"
-    return kind if value is not None else "None"

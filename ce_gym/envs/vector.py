@@ -15,8 +15,9 @@ from ce_gym.envs.base import BaseEnv, check_options, checked_action, spaces
 from ce_gym.envs.rendering import RENDER_MODES
 from ce_gym.envs.runtime.batch import Outcome
 from ce_gym.envs.runtime.setup import make_batch
-from ce_gym.model.arguments import check_whole
+from ce_gym.model.arguments import check_shape, check_whole
 from ce_gym.sim.devices import Array, Device, device_named
+from ce_gym.sim.inputs import check_kind, check_mask, finite_array, real_array
 
 
 class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
@@ -187,18 +188,22 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
 
     @elapsed_steps.setter
     def elapsed_steps(self, steps: Any) -> None:
-        rows = self.batch.place.rows(steps, self.batch.dtype, (self.num_envs,))[:, None]
+        rows = np.broadcast_to(finite_array("elapsed_steps", steps, self.batch.dtype, (), (n := self.num_envs,)), n)
+        if (wrong := rows[(rows < 0) | (rows != np.floor(rows))]).size:
+            raise ValueError(f"elapsed_steps holds {wrong[0]:g}; expected whole numbers, 0 or more")
         with self._exclusive():
-            self.batch.write("elapsed", rows)
+            self.batch.write("elapsed", rows[:, None])
 
     def _checked(self, actions: Any) -> Array:
         shape = (self.num_envs, self.batch.program.n_actions)
         if not self.batch.fused:
             return checked_action(actions, shape)
-        rows = self.batch.place.rows(actions, "float32").detach()
-        if tuple(rows.shape) != shape:
-            raise ValueError(f"action has shape {tuple(rows.shape)}; expected {shape}")
-        return rows
+        if getattr(actions, "is_cuda", False):
+            check_kind("action", actions)
+        else:
+            actions = real_array("action", actions)
+        check_shape("action", actions, shape)
+        return self.batch.place.rows(actions, "float32").detach()
 
     def _reset_mask(self, options: dict[str, Any] | None) -> Array:
         """Return the mask of `options`, which stays there for wrappers."""
@@ -207,11 +212,7 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         mask = (options or {}).get("reset_mask")
         if mask is None:
             return place.rows(True, "bool", (n,))
-        kind, shape = str(getattr(mask, "dtype", "")), tuple(getattr(mask, "shape", ()))
-        if kind.removeprefix("torch.") != "bool" or shape != (n,) or not mask.any():
-            text = " ".join(repr(mask).split())
-            raise ValueError(f"reset_mask={text}; expected a bool array of shape ({n},) with a true entry")
-        return place.rows(mask, "bool")
+        return place.rows(check_mask("reset_mask", mask, n, some=True), "bool")
 
 
 def _autoreset_mode(mode: str | AutoresetMode | None, place: Device) -> AutoresetMode:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from ce_gym.model.errors import RobotError
 from ce_gym.model.frames import ORIGIN, Placement, Vec3
@@ -50,7 +50,7 @@ class LinearConstraint(Constraint):
     """
 
     coefficients: tuple[tuple[str, float], ...]
-    offset: Finite = 0.0
+    offset: Annotated[Finite, "rad or m"] = 0.0
     linear: ClassVar[bool] = True
 
     @property
@@ -123,7 +123,7 @@ class RodConstraint(Constraint):
     second: str | None
     first_point: Vec3
     second_point: Vec3
-    length: Positive
+    length: Annotated[Positive, "m"]
 
     @property
     def ends(self) -> tuple[str | None, ...]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from ce_gym.model.coordinates import Layout, placed, sizes, unit_quaternions
 from ce_gym.model.drives import Battery, Elasticity, Motor
 from ce_gym.model.errors import listed_names
 from ce_gym.model.frames import ORIGIN, Mat3, Placement, Vec3, added
-from ce_gym.model.ranges import Finite, NotNegative, NotNegativeOrInfinite, Positive
+from ce_gym.model.ranges import Finite, NotNegative, NotNegativeOrInfinite, Positive, Share
 
 UNKNOWN_RATIO = 1e6
 """Gear ratio in place of an unknown one: the rotor's own inertia is then 1e-12 of the reflected inertia."""
@@ -72,12 +72,12 @@ class Joint:
     type: Literal["free", "ball", "revolute", "prismatic"]
     axis: Vec3 = (0.0, 0.0, 1.0)
     position: tuple[float, float] = (-float("inf"), float("inf"))
-    torque: NotNegativeOrInfinite = float("inf")
-    velocity: NotNegativeOrInfinite = float("inf")
-    damping: NotNegative = 0.0
-    friction: NotNegative = 0.0
-    stiffness: NotNegative = 0.0
-    springref: Finite = 0.0
+    torque: Annotated[NotNegativeOrInfinite, "N m or N"] = float("inf")
+    velocity: Annotated[NotNegativeOrInfinite, "rad/s or m/s"] = float("inf")
+    damping: Annotated[NotNegative, "N m s/rad or N s/m"] = 0.0
+    friction: Annotated[NotNegative, "N m or N"] = 0.0
+    stiffness: Annotated[NotNegative, "N m/rad or N/m"] = 0.0
+    springref: Annotated[Finite, "rad or m"] = 0.0
     name: str = ""
 
     @property
@@ -118,9 +118,9 @@ class Shape:
     """
 
     type: Literal["box", "cylinder", "capsule", "sphere"]
-    size: tuple[float, ...]
+    size: tuple[Annotated[NotNegative, "m"], ...]
     placement: Placement = ORIGIN
-    color: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+    color: tuple[Share, Share, Share, Share] = (0.7, 0.7, 0.7, 1.0)
 
 
 @dataclass(frozen=True)
@@ -178,9 +178,9 @@ class ContactSphere:
     name: str
     body: str
     position: Vec3
-    radius: NotNegative
+    radius: Annotated[NotNegative, "m"]
     group: str = "foot"
-    rim: NotNegative = 0.0
+    rim: Annotated[NotNegative, "m"] = 0.0
     axis: Vec3 = (0.0, 0.0, 1.0)
     shape: str = ""
 
@@ -209,7 +209,7 @@ class Capsule:
     body: str
     start: Vec3
     end: Vec3
-    radius: Positive
+    radius: Annotated[Positive, "m"]
 
 
 @dataclass(frozen=True)
@@ -225,12 +225,12 @@ class ContactMaterial:
         dissipation: Normal dissipation of Hunt and Crossley's law [s/m], which then takes the place of damping.
     """
 
-    stiffness: NotNegative = 5e4
-    damping: NotNegative = 500.0
-    friction: NotNegative = 0.8
-    slip_speed: Positive = 1e-3
-    bristle: NotNegative = 5e4
-    dissipation: NotNegative | None = None
+    stiffness: Annotated[NotNegative, "N/m"] = 5e4
+    damping: Annotated[NotNegative, "N s/m"] = 500.0
+    friction: Annotated[NotNegative, "-"] = 0.8
+    slip_speed: Annotated[Positive, "m/s"] = 1e-3
+    bristle: Annotated[NotNegative, "N/m"] = 5e4
+    dissipation: Annotated[NotNegative, "s/m"] | None = None
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ class Pose:
         balls: Pairs (body, quaternion wxyz of norm 1 within 1e-3) for ball joints; others have no rotation.
     """
 
-    height: Finite = 0.0
+    height: Annotated[Finite, "m"] = 0.0
     joints: tuple[tuple[str, float], ...] = ()
     balls: tuple[tuple[str, tuple[float, float, float, float]], ...] = ()
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from ce_gym.model.ranges import (
+    HeatCapacity,
     NotNegative,
     NotNegativeOrInfinite,
     Positive,
@@ -12,6 +14,7 @@ from ce_gym.model.ranges import (
     PositiveShare,
     Share,
     Temperature,
+    ThermalResistance,
 )
 
 ELASTIC_FACTORS = "drive_stiffness", "drive_damping", "backlash"
@@ -49,18 +52,18 @@ class DriveFriction:
         factor: Factor on all terms [-].
     """
 
-    stribeck: NotNegative = 0.0
-    stribeck_speed: PositiveOrInfinite = float("inf")
-    stribeck_exponent: PositiveOrInfinite = 2.0
-    load_motor: NotNegative = 0.0
-    load_external: NotNegative = 0.0
-    stribeck_load_motor: NotNegative = 0.0
-    stribeck_load_external: NotNegative = 0.0
-    stribeck_square_motor: NotNegative = 0.0
-    stribeck_square_external: NotNegative = 0.0
-    efficiency: PositiveShare = 1.0
-    backdriving_efficiency: Share = 1.0
-    factor: NotNegative = 1.0
+    stribeck: Annotated[NotNegative, "N m"] = 0.0
+    stribeck_speed: Annotated[PositiveOrInfinite, "rad/s"] = float("inf")
+    stribeck_exponent: Annotated[PositiveOrInfinite, "-"] = 2.0
+    load_motor: Annotated[NotNegative, "-"] = 0.0
+    load_external: Annotated[NotNegative, "-"] = 0.0
+    stribeck_load_motor: Annotated[NotNegative, "-"] = 0.0
+    stribeck_load_external: Annotated[NotNegative, "-"] = 0.0
+    stribeck_square_motor: Annotated[NotNegative, "1/(N m)"] = 0.0
+    stribeck_square_external: Annotated[NotNegative, "1/(N m)"] = 0.0
+    efficiency: Annotated[PositiveShare, "-"] = 1.0
+    backdriving_efficiency: Annotated[Share, "-"] = 1.0
+    factor: Annotated[NotNegative, "-"] = 1.0
 
     @property
     def shares(self) -> tuple[float, ...]:
@@ -91,10 +94,10 @@ class Heat:
         ambient: Temperature of the air, and of a motor after a long rest [deg C].
     """
 
-    winding_capacity: PositiveOrInfinite
-    housing_capacity: PositiveOrInfinite
-    winding_to_housing: PositiveOrInfinite
-    housing_to_ambient: PositiveOrInfinite
+    winding_capacity: HeatCapacity
+    housing_capacity: HeatCapacity
+    winding_to_housing: ThermalResistance
+    housing_to_ambient: ThermalResistance
     warm: Temperature = 100.0
     hot: Temperature = 125.0
     ambient: Temperature = 25.0
@@ -111,10 +114,10 @@ class Battery:
         idle: Power of all consumers but the motors [W].
     """
 
-    voltage: PositiveOrInfinite
-    resistance: NotNegative
-    nominal: PositiveOrInfinite
-    idle: NotNegative = 0.0
+    voltage: Annotated[Positive, "V"]
+    resistance: Annotated[NotNegative, "ohm"]
+    nominal: Annotated[Positive, "V"]
+    idle: Annotated[NotNegative, "W"] = 0.0
 
 
 @dataclass(frozen=True)
@@ -137,14 +140,14 @@ class Motor:
     """
 
     rotor: str
-    torque: NotNegativeOrInfinite = float("inf")
-    velocity: PositiveOrInfinite = float("inf")
-    stall: NotNegativeOrInfinite | None = None
-    damping: NotNegative = 0.0
-    friction: NotNegative = 0.0
+    torque: Annotated[NotNegativeOrInfinite, "N m"] = float("inf")
+    velocity: Annotated[PositiveOrInfinite, "rad/s"] = float("inf")
+    stall: Annotated[NotNegativeOrInfinite, "N m"] | None = None
+    damping: Annotated[NotNegative, "N m s/rad"] = 0.0
+    friction: Annotated[NotNegative, "N m"] = 0.0
     drive_friction: DriveFriction | None = None
-    bandwidth: PositiveOrInfinite = float("inf")
-    motor_constant: PositiveOrInfinite | None = None
+    bandwidth: Annotated[PositiveOrInfinite, "Hz"] = float("inf")
+    motor_constant: Annotated[PositiveOrInfinite, "N m/sqrt(W)"] | None = None
     heat: Heat | None = None
     cogging: tuple[tuple[int, float, float], ...] = ()
 
@@ -177,11 +180,11 @@ class Elasticity:
     """
 
     rotor: str
-    stiffness: Positive
-    damping: NotNegative = 0.0
-    backlash: NotNegative = 0.0
-    preload: PositiveOrInfinite = float("inf")
-    play: float = 1.0
+    stiffness: Annotated[Positive, "N m/rad"]
+    damping: Annotated[NotNegative, "N m s/rad"] = 0.0
+    backlash: Annotated[NotNegative, "rad"] = 0.0
+    preload: Annotated[PositiveOrInfinite, "N m"] = float("inf")
+    play: Annotated[NotNegative, "-"] = 1.0
 
     @property
     def stretch(self) -> str:

@@ -23,7 +23,10 @@ from ce_gym.dynamics.stepping.derivatives import adjoint_weights, input_gradient
 from ce_gym.dynamics.stepping.halving import PART, subdivide_function
 from ce_gym.dynamics.stepping.linearization import REMEMBERED
 from ce_gym.dynamics.stepping.variables import LEFT, RETRIES, StepVariables
+from ce_gym.model.arguments import check_whole
+from ce_gym.model.errors import check_names
 from ce_gym.sim.derivative_kernels import load_gradient_kernel, load_linearization_kernel
+from ce_gym.sim.inputs import finite_array
 from ce_gym.sim.simulator import Simulator
 from ce_gym.sim.substeps import DT, TIMES, load_step_kernel
 from ce_gym.sim.tiles import read_rows, tiles, write_rows
@@ -86,8 +89,7 @@ class StepDerivatives:
             raise ValueError(f"derivatives of a simulator on device {simulator.device!r}; expected 'cpu'")
         if simulator.controlled:
             raise ValueError("derivatives of a simulator with a controller; expected one without")
-        if isinstance(keep_every, bool) or not isinstance(keep_every, int | np.integer) or keep_every < 1:
-            raise ValueError(f"keep_every={keep_every!r}; expected a whole number, at least 1")
+        check_whole("keep_every", keep_every, 1)
         self.simulator, self._records = simulator, list[Record]()
         self._keep_every, self._linear = keep_every, dict[bool, Any]()
         primal = primal_function(simulator.model.mechanism, simulator.options)
@@ -137,10 +139,21 @@ class StepDerivatives:
     def restore(self, state: Mapping[str, ArrayLike]) -> None:
         """Set parts of the state, and clear divergence; other parts do not change.
 
-        Quaternions whose norm is within 1e-3 of 1 are scaled to unit length; others raise a ValueError.
+        Quaternions whose norm is within 1e-3 of 1 are scaled to unit length.
+
+        Args:
+            state: Some of the parts of `state`, shape (num_envs, size) each.
+
+        Raises:
+            ValueError: If a part does not exist, a shape is wrong, or a number is not finite or no unit quaternion.
         """
         batch = self.simulator._batch
-        for name, rows in {name: batch.unit(name, np.asarray(rows)) for name, rows in state.items()}.items():
+        check_names("state", state, self._parts, "one of")
+        checked = {}
+        for name, rows in state.items():
+            shape = batch.num_envs, batch.schema[name].size
+            checked[name] = batch.unit(name, finite_array(name, rows, batch.dtype, shape))
+        for name, rows in checked.items():
             batch.write(name, rows)
         batch.write("diverged", 0.0)
 
@@ -271,20 +284,14 @@ class StepDerivatives:
         return [name for name in self._kernel.buffers if name in self.simulator._arrays]
 
     def _target(self, target: ArrayLike) -> NDArray:
-        shape = (self.simulator.num_envs, len(self.simulator.target_names))
-        rows = np.asarray(target, self.simulator.dtype)
-        if rows.shape not in (shape, shape[1:]):
-            raise ValueError(f"target has shape {rows.shape}; expected {shape[1:]} or {shape}")
-        return np.ascontiguousarray(np.broadcast_to(rows, shape))
+        return self.simulator._checked_target(target)
 
     def _weights(self, weights: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
         if unknown := set(weights) - set(self.state_sizes):
             raise ValueError(f"weights of {min(unknown)!r}; expected some of {', '.join(self.state_sizes)}")
         rows = {name: np.zeros((self.simulator.num_envs, size)) for name, size in self.state_sizes.items()}
         for name, value in weights.items():
-            if np.shape(value) != rows[name].shape:
-                raise ValueError(f"weights of {name!r} have shape {np.shape(value)}; expected {rows[name].shape}")
-            rows[name] = np.array(value, float)
+            rows[name] = finite_array(f"weights[{name!r}]", value, "float64", rows[name].shape)
         return rows
 
     def _gradient(

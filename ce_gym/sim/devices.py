@@ -193,8 +193,10 @@ def device_named(device: str | Device) -> Device:
     Raises:
         ValueError: If there is no such device; one line.
     """
-    if not isinstance(device, str):
+    if isinstance(device, Cpu | Cuda):
         return device
+    if not isinstance(device, str):
+        raise ValueError(f"device={device!r}; expected 'cpu', 'cuda' or 'cuda:N'")
     if device == "cpu":
         return Cpu()
     kind, _, number = device.partition(":")

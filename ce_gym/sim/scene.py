@@ -56,8 +56,9 @@ def resolve_scene(
         "ground": "field" if terrain is not None and contacts else "flat",
         "hulls": hulls_on(model.robot, contacts, terrain),
     }
+    material = model.robot.material if material is None else material
     given = {"control": control, "joint_control": tuple(joint_control), "parameters": tuple(parameters)}
-    options = StepOptions(**scene.shared | resolved | given, material=material or model.robot.material)
+    options = StepOptions(**scene.shared | resolved | given, material=material)
     period, samples = scene.control_period, control.endswith("position") and not METHODS[scene.method].controlled
     check("control_period", period, period == 0 or samples, "0, but for control of positions in steps of one length")
     return options

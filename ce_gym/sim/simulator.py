@@ -26,6 +26,7 @@ from ce_gym.model.options import check_fields
 from ce_gym.sim.batch import Batch, File, Snapshot
 from ce_gym.sim.devices import Array, Device, device_named, to_numpy
 from ce_gym.sim.ground_clearance import GroundClearance
+from ce_gym.sim.inputs import check_kind, check_mask, finite_array, real_array
 from ce_gym.sim.interruptible_runs import is_long, run_substeps
 from ce_gym.sim.scene import resolve_scene
 from ce_gym.sim.schema import COUNT, Row, Steps, physics_rows
@@ -114,10 +115,10 @@ class Simulator:
         check_choice("dtype", dtype, ("float64", "float32"))
         check_names("outputs", outputs, OUTPUTS, "one of")
         check_fields(SceneOptions, options, others=arguments)
-        defaults = parameter_defaults(model.robot, material or model.robot.material, parameters)
         given = options if dt is None else {"dt": dt, **options}
         self.scene = SceneOptions(**(scene or SceneOptions()).shared | given)
         self.options = resolve_scene(self.scene, model, terrain, control, parameters, material)
+        defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
         check_effects(model.mechanism, self.options)
         self._device = device_named(device)
         self.device = self._device.name
@@ -175,12 +176,9 @@ class Simulator:
             ValueError: If a shape is wrong, a number is not finite, the norm of a quaternion is not within 1e-3 of 1,
                 or a loop does not close.
         """
-        chosen, rows = self._chosen(mask), {"q": to_numpy(q), "v": to_numpy(v)}
-        for name, value in rows.items():
-            size = self._arrays[name].shape[1]
-            check_shape(name, value, (size,), (self.num_envs, size))
-            if not (np.abs(value) <= np.finfo(self.dtype).max).all():
-                raise ValueError(f"{name} holds a number that is not finite in {self.dtype}")
+        chosen, rows = self._chosen(mask), {}
+        for name, value, size in (("q", q, self.model.nq), ("v", v, self.model.nv)):
+            rows[name] = finite_array(name, value, self.dtype, (size,), (self.num_envs, size))
         rows["q"] = self._batch.unit("q", rows["q"])
         resting = self._resting_load(rows["q"]) if self.contact_names else np.zeros(0)
         for field in self._memory:
@@ -213,15 +211,21 @@ class Simulator:
             ValueError: If a shape is wrong, a target is not finite, or `n_substeps` is not a whole number from 0.
             RuntimeError: If another thread steps or sets the same robots.
         """
-        n = len(self.target_names)
-        rows = self._device.rows(target, self.dtype)
-        check_shape("target", rows, (n,), (self.num_envs, n))
-        if isinstance(rows, np.ndarray) and not np.isfinite(rows).all():
-            raise ValueError(f"target holds a number that is not finite in {self.dtype}")
+        rows = self._checked_target(target)
         check_whole("n_substeps", n_substeps, 0)
-        rows = self._device.rows(rows, self.dtype, (self.num_envs, n))
         with self._section:
             self._advance({COMMAND if self.controlled else "target": rows}, n_substeps)
+
+    def _checked_target(self, target: Any) -> Array:
+        """Return a target as rows of the device, shape (num_envs, n_targets); numbers on a GPU are not checked."""
+        n = len(self.target_names)
+        shapes = (n,), (self.num_envs, n)
+        if getattr(target, "is_cuda", False):
+            check_kind("target", target)
+            check_shape("target", target, *shapes)
+        else:
+            target = finite_array("target", target, self.dtype, *shapes)
+        return self._device.rows(target, self.dtype, shapes[1])
 
     def _advance(self, given: dict[str, Array], n_substeps: int) -> None:
         """Step all robots; if Ctrl-C interrupts a long call, restore the state before."""
@@ -253,8 +257,9 @@ class Simulator:
         if name not in self._columns:
             expected = "one of those declared with Simulator(..., parameters=)"
             raise ValueError(f"parameter {name!r}; expected {expected}: {listed_names(name, self._columns)}")
-        columns, chosen, new = self._columns[name], self._chosen(mask), to_numpy(value)
+        columns, chosen = self._columns[name], self._chosen(mask)
         size = int(columns.stop - columns.start)
+        new = real_array(name, value)
         check_shape(name, new, (), (size,), (self.num_envs, size))
         check_parameter(self.model.robot, name, new)
         with self._section:
@@ -362,11 +367,8 @@ class Simulator:
         """
         return self._read(name)
 
-    def _chosen(self, mask: ArrayLike | None) -> NDArray[np.bool_] | None:
-        chosen = None if mask is None else to_numpy(mask).astype(bool)
-        if chosen is not None:
-            check_shape("mask", chosen, (self.num_envs,))
-        return chosen
+    def _chosen(self, mask: ArrayLike | None) -> Array | None:
+        return None if mask is None else check_mask("mask", mask, self.num_envs)
 
     def _resting_load(self, q: ArrayLike) -> NDArray:
         """Return the forces of the contacts' springs, for the first friction cone [N], shape (..., n_contacts)."""

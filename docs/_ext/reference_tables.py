@@ -20,6 +20,7 @@ from environment_page import attributes_of, plain, table, task_fields
 from ce_gym.__main__ import _parser
 from ce_gym.bench.measure.report import Report, cell_text, read_report
 from ce_gym.dynamics.laws.scene_laws import OUTPUTS, PARAMETERS
+from ce_gym.dynamics.parameters import RANGES
 from ce_gym.envs.task.tasks import RANDOMISED
 from ce_gym.envs.terms.context import TermContext
 from ce_gym.envs.terms.registry import OWN
@@ -85,7 +86,7 @@ def task_arguments() -> str:
 
 def parameters() -> str:
     """Return the table of parameters that can differ from robot to robot."""
-    rows = [(f"`{p.name}`", p.meaning, p.unit, f"`{p.size}`", p.allowed) for p in PARAMETERS.values()]
+    rows = [(f"`{p.name}`", p.meaning, p.unit, f"`{p.size}`", RANGES[p.allowed].expected) for p in PARAMETERS.values()]
     return table(("Parameter", "Meaning", "Unit", "Size", "Allowed values"), rows) + "\n"
 
 

@@ -53,12 +53,17 @@ KINDS = {
 """A robot for every kind of transmission."""
 
 
+def _as_link(body: Body) -> Body:
+    """A rotor as a link, which must have some mass."""
+    return replace(body, kind="link", inertial=replace(body.inertial, mass=max(body.inertial.mass, 1e-14)))
+
+
 def untied(robot: Robot) -> Robot:
     """The same bodies with every rotor free to turn, a link like others."""
     rotors = [rotor.name for rotor in robot.rotors()]
     return replace(
         robot,
-        bodies=tuple(replace(body, kind="link") for body in robot.bodies),
+        bodies=tuple(_as_link(body) for body in robot.bodies),
         constraints=tuple(tie for tie in robot.constraints if not set(tie.bodies) & set(rotors)),
         independent=(*robot.independent, *rotors),
         motors=(),

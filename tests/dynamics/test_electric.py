@@ -15,6 +15,7 @@ from scipy.optimize import brentq
 
 from ce_gym.dynamics import Model
 from ce_gym.dynamics.forces.scene import StepOptions
+from ce_gym.dynamics.forces.supply import LARGEST_RISE, warmed
 from ce_gym.dynamics.laws.scene_laws import state_sizes
 from ce_gym.dynamics.stepping.trace import iteration_function, step_function
 from ce_gym.model import Battery, Heat, LinearConstraint, Motor, Robot
@@ -82,6 +83,25 @@ def test_heat_balances_in_every_step():
     lost = (tau / K) ** 2 * (1 + COPPER * (HEAT.ambient - 20.0 + w))
     stored = HEAT.winding_capacity * w + HEAT.housing_capacity * h
     np.testing.assert_allclose(np.diff(stored), dt * (lost - h / HEAT.housing_to_ambient)[1:], rtol=1e-10)
+
+
+def test_a_winding_is_never_colder_than_the_air_at_any_figures_in_range():
+    """Nor does a step heat it without bound, although the resistance that rises with the winding is implicit."""
+    n, rng = 4000, np.random.default_rng(0)
+    names = ("winding_capacity", "housing_capacity", "winding_to_housing", "housing_to_ambient")
+    low = np.array([-3.0, -3.0, -4.0, -4.0, -12.0, -12.0, -5.0])
+    figures = 10 ** rng.uniform(low, [12.0, 12.0, 12.0, 12.0, 12.0, 12.0, -1.0], (n, 7))
+    figures[: n // 2, :6] = 10 ** rng.normal(np.log10([2.0, 20.0, 1.5, 3.0, 1e-3, 1.0]), 1.0, (n // 2, 6))
+    warmth, ambient = rng.uniform(0, 200, (n, 2)), rng.uniform(-200, 1000, n)
+    x = ca.SX.sym("x", 10)
+    heat = Heat(**dict(zip(names, ca.vertsplit(x[:4]), strict=True)), ambient=x[9])
+    after = warmed(Motor("rotor", motor_constant=x[4]), heat, x[7], x[8], x[5], x[6])
+    step = ca.Function("step", [x], [ca.vertcat(*after)]).map(n)
+    winding, housing = step(np.column_stack([figures, warmth, ambient]).T).full()
+    highest = warmth.max(axis=1)
+    assert (winding >= -1e-6).all()
+    assert (housing >= -1e-6).all()
+    assert (np.maximum(winding, housing) <= highest + 2 * LARGEST_RISE + 1e-6).all()
 
 
 def test_a_hot_motor_holds_back_and_comes_to_the_temperature_at_which_it_does():

@@ -239,7 +239,7 @@ def test_singular_choice_is_refused():
 
 def test_wrong_loops_are_refused():
     with pytest.raises(RobotError, match=r"pin, gear, has 1 freedom, .*: expected as many independent joints"):
-        Model(four_bar(independent=("crank", "coupler")))
+        Model(four_bar(independent=("crank", "coupler"), assembly=()))
     pin = four_bar().constraints[0]
     assert isinstance(pin, LoopConstraint)
     far = replace(pin, second_placement=replace(pin.second_placement, position=(5.0, 0.0, 0.0)))

@@ -34,7 +34,7 @@ def plain() -> Robot:
 def rich() -> Robot:
     """A robot that has everything; one of its rotors is a body of the recursion at the exact level."""
     robot = load_robot(TRIPOD)
-    heat = Heat(2.0, 20.0, 1.5, 3.0, warm=20.0, ambient=30.0)
+    heat = Heat(2.0, 20.0, 1.5, 3.0, warm=30.1, ambient=30.0)
     drive = DriveFriction(stribeck=0.05, stribeck_speed=5.0, load_motor=0.1)
     figures = {"motor_constant": 0.1, "heat": heat, "cogging": ((6, 0.02, 0.3),), "drive_friction": drive}
     first, *_ = robot.rotors()

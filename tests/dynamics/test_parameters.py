@@ -405,7 +405,7 @@ def test_errors_name_what_was_expected(tripod: Robot):
         sim.set_parameter(f"com_shift:{BASE}", [0.0, 1.0])
     with pytest.raises(ValueError, match=r"friction=nan; expected 0 or more"):
         sim.set_parameter("friction", np.nan)
-    with pytest.raises(ValueError, match=r"mask has shape \(3,\); expected \(2,\)"):
+    with pytest.raises(ValueError, match=r"mask=.*; expected a bool array of shape \(2,\)"):
         sim.set_parameter("friction", 0.5, np.ones(3, bool))
     with pytest.raises(ValueError, match=r"parameters='colour'; expected one of gravity, .*, BODY being a link"):
         Simulator(model, parameters=("colour",))

@@ -55,6 +55,19 @@ def test_parallel_joints_in_one_place_with_nothing_between_them():
     assert np.linalg.eigvalsh(Model(moved).mass_matrix([0.0, 0.0]))[0] > 0.0
 
 
+@pytest.mark.parametrize("ratio", [1e6, 1e9])
+def test_a_ratio_that_leaves_no_digits_is_refused(ratio: float):
+    """A rotor on one of two joints: the condition number of the mass matrix is about the squared ratio."""
+    rotor = Body("rotor", "rotor", None, Placement(), Joint("revolute", (0.0, 1.0, 0.0)), link("x", None).inertial)
+    tie = LinearConstraint("gear", (("rotor", 1.0), ("b", -ratio)))
+    robot = Robot("r", (link("a", None), link("b", "a"), rotor), (tie,), ("a", "b"))
+    if ratio == 1e6:
+        Model(robot)
+    else:
+        with pytest.raises(RobotError, match=r"eigenvalues from .* \(a\) to .* \(b\): expected a ratio of at most 1e\+14"):
+            Model(robot)
+
+
 def test_a_differential_of_ratio_1e10_hides_its_links():
     rotor = Body("rotor", "rotor", None, Placement(), Joint("revolute", (0.0, 1.0, 0.0)), link("x", None).inertial)
     for ratio, works in ((10.0, True), (1e10, False)):

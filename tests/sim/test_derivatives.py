@@ -359,7 +359,7 @@ def test_bad_arguments_are_named():
     derivatives = StepDerivatives(Simulator(model))
     with pytest.raises(ValueError, match="weights of 'height'; expected some of q, v"):
         derivatives.backward({"height": np.zeros(1)})
-    with pytest.raises(ValueError, match=r"weights of 'q' have shape \(2,\); expected \(1, 2\)"):
+    with pytest.raises(ValueError, match=r"weights\['q'\] has shape \(2,\); expected \(1, 2\)"):
         derivatives.backward({"q": np.zeros(2)})
 
 

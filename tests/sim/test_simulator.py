@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tripod import TRIPOD
 
-from ce_gym import Model, Simulator
+from ce_gym import Model, Simulator, StepDerivatives
 from ce_gym.dynamics.stepping.trace import step_function
 from ce_gym.model import ContactMaterial
 from ce_gym.model.mechanism import LEVELS
@@ -140,6 +140,63 @@ def test_dropped_robots_come_to_rest(model: Model, dt: float, stiffness: float, 
 def test_bad_arguments(model: Model, arguments: dict, message: str):
     with pytest.raises(ValueError, match=message):
         Simulator(model, **arguments)
+
+
+NO_MASKS = {
+    "indices": [0, 2, 1],
+    "numbers": np.array([1.0, 0.0, 1.0]),
+    "NaN": [np.nan, True, False],
+    "None": [None, True, False],
+    "text": "all",
+    "too short": np.array([True]),
+    "one": True,
+}
+
+
+@pytest.mark.parametrize("mask", NO_MASKS.values(), ids=NO_MASKS)
+def test_masks_are_truth_values(model: Model, mask):
+    """Indices are not read as truth values, by any call that takes a mask."""
+    sim = Simulator(model, 3, parameters=("friction",))
+    before = sim.snapshot()
+    for call in (
+        lambda: sim.reset(mask),
+        lambda: sim.set_state(model.standing_q + 0.1, np.ones(model.nv), mask),
+        lambda: sim.set_parameter("friction", 0.1, mask),
+    ):
+        with pytest.raises(ValueError, match=r"^mask=.*; expected a bool array of shape \(3,\)$"):
+            call()
+    for name, rows in sim.snapshot().items():
+        np.testing.assert_array_equal(rows, before[name])
+    sim.reset([True, False, True])
+
+
+NO_NUMBERS = {
+    "complex": np.zeros(2) + 1j,
+    "text": np.array(["0.1", "0.2"]),
+    "dates": np.zeros(2, "datetime64[s]"),
+    "truth values": np.array([True, False]),
+    "fields": np.zeros(2, [("a", float)]),
+    "objects": [None, 1.0],
+    "ragged": [[1.0], [1.0, 2.0]],
+}
+
+
+@pytest.mark.parametrize("values", NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_what_is_no_real_number_is_refused(model: Model, values):
+    sim = Simulator(model, 2, parameters=("kp",))
+    derivatives = StepDerivatives(sim)
+    for name, call in {
+        "target": lambda: sim.step(values),
+        "q": lambda: sim.set_state(values, np.zeros(model.nv)),
+        "v": lambda: sim.set_state(model.standing_q, values),
+        "kp": lambda: sim.set_parameter("kp", values),
+        "load": lambda: derivatives.restore({"load": values}),
+    }.items():
+        with pytest.raises(ValueError, match=f"^{name} is .*; expected an array of real numbers"):
+            call()
+    for call in (derivatives.step, lambda x: derivatives.gradient(x, {}), derivatives.linearize):
+        with pytest.raises(ValueError, match=r"^target is .*; expected an array of real numbers"):
+            call(values)
 
 
 def test_bad_states_and_targets(model: Model):

@@ -131,17 +131,17 @@ def test_a_diverged_robot_reports_numbers(model: Model):
 @pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
-        ("friction", -0.1, "friction=-0.1; expected 0 or more"),
-        ("stiffness", -1.0, "stiffness=-1; expected 0 or more"),
-        ("ratio", 0.0, "ratio=0; expected more than 0"),
-        ("slip_speed", 0.0, "slip_speed=0; expected more than 0"),
-        ("kp", np.array([1.0, -2.0]), "kp=-2; expected 0 or more"),
+        ("friction", -0.1, "friction=-0.1; expected 0 or more, up to 1e+12 [-]"),
+        ("stiffness", -1.0, "stiffness=-1; expected 0 or more, up to 1e+12 [N/m]"),
+        ("ratio", 0.0, "ratio=0; expected more than 0, from 1e-12 to 1e+12 [-]"),
+        ("slip_speed", 0.0, "slip_speed=0; expected more than 0, from 1e-12 to 1e+12 [m/s]"),
+        ("kp", np.array([1.0, -2.0]), "kp=-2; expected 0 or more, up to 1e+12 [N m/rad or N/m]"),
         (
             "added_mass:plate",
             -50.0,
             "added_mass:plate=-50; expected more than -3 kg, what the body has",
         ),
-        ("gravity", [0.0, 0.0, np.nan], "gravity=nan; expected finite numbers"),
+        ("gravity", [0.0, 0.0, np.nan], "gravity=nan; expected finite numbers, up to 1e+12 in size [m/s^2]"),
     ],
 )
 def test_parameters_have_ranges(model: Model, name: str, value, expected: str):

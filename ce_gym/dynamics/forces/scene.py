@@ -20,6 +20,7 @@ from ce_gym.model.arguments import check
 from ce_gym.model.description import ContactMaterial, ContactSphere
 from ce_gym.model.mechanism import Mechanism
 from ce_gym.model.options import Options, names, number, one_of, option, optional, pairs_of_names, positive, whole
+from ce_gym.model.ranges import check_fields
 
 Control = Literal["position", "torque", "motor_position", "motor_torque"]
 JointControl = Literal["velocity", "torque"]
@@ -78,6 +79,13 @@ class SceneOptions(Options):
         return {each.name: getattr(self, each.name) for each in fields(SceneOptions)}
 
 
+def contact_material(name: str, value: Any) -> ContactMaterial:
+    """Check the material of contacts."""
+    check(name, value, isinstance(value, ContactMaterial), "a ContactMaterial or None")
+    check_fields(value, "Simulator", f"{name}.")
+    return value
+
+
 @dataclass(frozen=True)
 class StepOptions(SceneOptions):
     """Scene options with names resolved for one robot, and further options of its steps.
@@ -102,7 +110,7 @@ class StepOptions(SceneOptions):
     self_collisions: tuple[tuple[str, str], ...] = ()
     control: Control = "position"
     joint_control: tuple[tuple[str, JointControl], ...] = ()
-    material: ContactMaterial = field(default_factory=ContactMaterial)
+    material: ContactMaterial = option(contact_material, ContactMaterial())
     parameters: tuple[str, ...] = ()
     ground: Ground = "flat"
     hulls: tuple[Hull, ...] = ()

@@ -6,8 +6,10 @@
 
 with w and h above the air, K the motor constant and R the winding's resistance over that at 20 deg C, which rises with
 the winding. The model is the one of data sheets (maxon, "Technology - short and to the point", chapter 7). Its step is
-linearly implicit and cannot overshoot. It follows the step of the mechanics and uses the torque of that step, because
-temperatures hardly change in a sub-step. It costs some twenty instructions for each motor.
+linearly implicit and cannot overshoot. The implicit rise of R has a pole where `dt (tau / K)^2 dR/dw = C_w`, so it is
+limited to half of C_w, and the loss of a step to `LARGEST_RISE`. The step of the temperatures follows the step of the
+mechanics and uses its torque, because temperatures hardly change in a sub-step. It costs some twenty instructions for
+each motor.
 
 *Voltage.* A battery feeds all motors, behind a resistance:
 
@@ -33,6 +35,8 @@ COPPER = 3.93e-3
 """How the resistance of copper rises, as a share of that at `REFERENCE` [1/K] (IEC 60028)."""
 REFERENCE = 20.0
 """Temperature at which motor constants are what they are [deg C]."""
+LARGEST_RISE = 500.0
+"""Largest rise of a winding by its loss in a step, were its resistance constant: far beyond any real motor [K]."""
 LEAST = 0.5
 """Share of the voltage without load at which a battery gives its largest power."""
 GENTLE = 0.2
@@ -143,11 +147,14 @@ def warmed(motor: Motor, heat: Heat, winding: SX, housing: SX, torque: SX, dt: S
         dt: Length of the step [s].
     """
     loss, flow, out = copper_loss(motor, torque), 1 / heat.winding_to_housing, 1 / heat.housing_to_ambient
-    across = flow * (winding - housing)
-    into_winding, into_housing = dt * (loss * resistance(heat, winding) - across), dt * (across - out * housing)
-    of_winding = heat.winding_capacity + dt * (flow - COPPER * loss)
-    of_housing, between = heat.housing_capacity + dt * (flow + out), dt * flow
-    scale = 1 / (of_winding * of_housing - between * between)
+    across, per_kelvin = flow * (winding - housing), heat.winding_capacity / SX(dt)
+    heating = ca.fmin(loss * resistance(heat, winding), LARGEST_RISE * per_kelvin)
+    growth = ca.fmin(COPPER * loss, per_kelvin / 2)
+    into_winding, into_housing = dt * (heating - across), dt * (across - out * housing)
+    to_air, between = heat.housing_capacity + dt * out, dt * flow
+    alone = heat.winding_capacity - dt * growth
+    of_winding, of_housing = alone + between, to_air + between
+    scale = 1 / (alone * of_housing + between * to_air)
     rise = scale * (of_housing * into_winding + between * into_housing)
     return winding + rise, housing + scale * (between * into_winding + of_winding * into_housing)
 

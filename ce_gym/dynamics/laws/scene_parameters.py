@@ -12,7 +12,7 @@ from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.normal import HuntCrossley, normal_law
 from ce_gym.dynamics.forces.scene import Scene, StepOptions
 from ce_gym.dynamics.laws.scene_laws import LAWS, PARAMETERS
-from ce_gym.dynamics.parameters import check_ratios, least_value, with_parameters
+from ce_gym.dynamics.parameters import RANGES, check_ratios, least_value, with_parameters
 from ce_gym.model.description import ContactMaterial, Robot
 from ce_gym.model.errors import check_names
 from ce_gym.model.mechanism import Mechanism
@@ -51,17 +51,12 @@ def check_parameter(robot: Robot, name: str, values: ArrayLike) -> None:
         ValueError: If a value is not finite or out of range; one line.
     """
     numbers, kind = np.asarray(values, dtype=float), name.split(":")[0]
-    allowed = next(parameter.allowed for parameter in PARAMETERS.values() if parameter.kind == kind)
-    least, expected = least_value(robot, name)
-    if kind == "added_mass":
-        good = numbers > least
-    elif allowed == "0 or more":
-        good, expected = numbers >= least, expected or allowed
-    else:
-        good = np.isfinite(numbers) if allowed == "finite" else numbers > 0
-        expected = "finite numbers" if allowed == "finite" else "more than 0"
-    if wrong := numbers[~(good & np.isfinite(numbers))].tolist():
-        raise ValueError(f"{name}={wrong[0]:g}; expected {expected}")
+    parameter = next(parameter for parameter in PARAMETERS.values() if parameter.kind == kind)
+    allowed, (least, expected) = RANGES[parameter.allowed], least_value(robot, name)
+    lowest = least if expected else allowed.lowest
+    good = (numbers > lowest if kind == "added_mass" else numbers >= lowest) & (numbers <= allowed.highest)
+    if wrong := numbers[~good].tolist():
+        raise ValueError(f"{name}={wrong[0]:g}; expected {expected or f'{allowed.expected} [{parameter.unit}]'}")
 
 
 def split_parameters(robot: Robot, material: ContactMaterial, names: Sequence[str], values: SX) -> dict[str, SX]:

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from ce_gym.model.coordinates import SIZES
-from ce_gym.model.description import SCREWS, Body, Joint
+from ce_gym.model.description import Body, Joint
 from ce_gym.model.errors import invalid_value
 from ce_gym.model.frames import Placement
 from ce_gym.model.ranges import LARGEST_FIGURE, check_fields
@@ -30,13 +29,14 @@ def check_body(body: Body, file: str, *, may_be_massless: bool = True) -> None:
     check_finite(file, f"{where} centre of mass", body.inertial.com)
     _check_inertia(file, f"{where} inertia", np.array(body.inertial.inertia))
     check_placement(file, f"{where} ", body.placement)
+    for shape in body.shapes:
+        check_placement(file, f"{where} {shape.type} ", shape.placement)
     if body.joint.type != "free":
         _check_joint(file, where, body.joint)
 
 
 def _check_joint(file: str, where: str, joint: Joint) -> None:
-    if joint.type not in (*SIZES, *SCREWS):
-        raise invalid_value(file, f"{where} joint type", joint.type, f"one of {', '.join((*SIZES, *SCREWS))}")
+    check_fields(joint, file, f"{where} joint ")
     if joint.type == "ball" and joint.friction:
         expected = "0, because ball joints have no dry friction"
         raise invalid_value(file, f"{where} joint friction", joint.friction, expected)
@@ -46,13 +46,13 @@ def _check_joint(file: str, where: str, joint: Joint) -> None:
     lower, upper = joint.position
     if not lower <= upper:
         raise invalid_value(file, f"{where} joint limits", joint.position, "a lower limit that is not above the upper")
-    check_fields(joint, file, f"{where} joint ")
 
 
 def check_placement(file: str, key: str, placement: Placement) -> None:
     """Check that a pose is finite and its rotation is a rotation matrix."""
     check_finite(file, f"{key}position", placement.position)
     rotation = np.array(placement.rotation)
+    check_finite(file, f"{key}rotation", rotation.ravel().tolist())
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0.0:
         raise invalid_value(file, f"{key}rotation", placement.rotation, "a rotation matrix")
 

@@ -20,7 +20,7 @@ from ce_gym.model.constraints import (
 )
 from ce_gym.model.description import Body, Robot
 from ce_gym.model.errors import RobotError, invalid_value, unknown_name
-from ce_gym.model.ranges import LARGEST_FIGURE, check_fields
+from ce_gym.model.ranges import LARGEST_FIGURE
 
 
 def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
@@ -34,7 +34,6 @@ def check_constraint(constraint: Constraint, robot: Robot, file: str) -> None:
         raise invalid_value(file, key, constraint.ends, "two different bodies")
     if not constraint.ends:
         _check_joints(constraint, names, key, file)
-    check_fields(constraint, file, f"{key} ")
     CHECKS[type(constraint)](constraint, key, file)
 
 

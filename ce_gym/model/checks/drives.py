@@ -9,7 +9,6 @@ from ce_gym.model.checks.body import check_unique
 from ce_gym.model.description import Robot
 from ce_gym.model.drives import DriveFriction, Heat, Motor
 from ce_gym.model.errors import invalid_value, unknown_name
-from ce_gym.model.ranges import check_fields
 
 
 def check_motors(robot: Robot, file: str) -> None:
@@ -20,7 +19,6 @@ def check_motors(robot: Robot, file: str) -> None:
         if motor.rotor not in rotors:
             raise unknown_name(file, "motors", motor.rotor, rotors, "the name of a rotor")
         key = f"motors.{motor.rotor}"
-        check_fields(motor, file, f"{key}.")
         if motor.drive_friction is not None:
             _check_friction(motor.drive_friction, file, f"{key}.friction")
         for i, (_, torque, _) in enumerate(motor.cogging):
@@ -33,7 +31,6 @@ def check_motors(robot: Robot, file: str) -> None:
     if len(ambient) > 1:
         raise invalid_value(file, "motors.*.heat.ambient", ambient, "one temperature of the air [deg C]")
     if robot.battery is not None:
-        check_fields(robot.battery, file, "battery.")
         for motor in robot.motors:
             key = f"motors.{motor.rotor}"
             _check_known(motor, file, key, "battery")
@@ -42,7 +39,6 @@ def check_motors(robot: Robot, file: str) -> None:
 
 
 def _check_friction(friction: DriveFriction, file: str, key: str) -> None:
-    check_fields(friction, file, f"{key}.")
     at_rest = [f.name for f in fields(friction) if f.name.startswith("stribeck") and f.default == 0.0]
     if math.isinf(friction.stribeck_speed) and any(getattr(friction, name) for name in at_rest):
         expected = "the speed at which the friction at rest has fallen to 37 % [rad/s]"
@@ -50,7 +46,6 @@ def _check_friction(friction: DriveFriction, file: str, key: str) -> None:
 
 
 def _check_heat(heat: Heat, file: str, key: str) -> None:
-    check_fields(heat, file, f"{key}.")
     if not heat.ambient < heat.warm < heat.hot:
         expected = f"more than {key}.warm, and that more than {key}.ambient"
         raise invalid_value(file, f"{key}.hot", heat.hot, expected)
@@ -79,6 +74,5 @@ def check_elastic(robot: Robot, file: str) -> None:
             raise invalid_value(file, key, elastic.rotor, expected)
         if elastic.stretch in names:
             raise invalid_value(file, "body name", elastic.stretch, f"another one: {elastic.rotor!r} is elastic")
-        check_fields(elastic, file, f"{key}.")
         if elastic.backlash and math.isfinite(elastic.preload):
             raise invalid_value(file, f"{key}.preload", elastic.preload, "no preload beside backlash")

@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import fields, is_dataclass
 from fnmatch import fnmatchcase
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -25,10 +27,11 @@ from ce_gym.model.checks.collisions import adjacent, capsules_of
 from ce_gym.model.checks.constraint import check_constraint
 from ce_gym.model.checks.drives import check_elastic, check_motors
 from ce_gym.model.clusters import Cluster, cluster_tree
-from ce_gym.model.constraints import LinearConstraint
+from ce_gym.model.constraints import Constraint, LinearConstraint
 from ce_gym.model.coordinates import UNIT_TOLERANCE
-from ce_gym.model.description import Robot
+from ce_gym.model.description import Body, Robot
 from ce_gym.model.errors import InertiaWarning, invalid_value, listed_names, unknown_name
+from ce_gym.model.mechanism import without_stretches
 from ce_gym.model.ranges import check_fields
 
 MOST_BODIES = 500
@@ -49,7 +52,9 @@ def check_robot(robot: Robot) -> None:
         InertiaWarning: An inertia violates the triangle inequality and is not listed in `kept_inertia`; once per
             process and robot.
     """
-    file = robot.source or robot.name
+    file = str(robot.source or robot.name)
+    check_description(robot, file)
+    robot = without_stretches(robot)
     _check_names(robot, file)
     _check_tree(robot, file)
     supported = {body.parent for body in robot.bodies} | _dependent(robot)
@@ -64,6 +69,35 @@ def check_robot(robot: Robot) -> None:
     check_elastic(robot, file)
     _check_pose_and_gains(robot, file)
     _check_inertia(robot, file)
+
+
+def check_description(description: Any, file: str, prefix: str = "") -> None:
+    """Check the types and ranges of all fields of a description and of its parts.
+
+    Args:
+        description: A dataclass.
+        file: Name of the file, for messages.
+        prefix: Beginning of keys in messages.
+
+    Raises:
+        RobotError: A value has another type or is out of range.
+    """
+    check_fields(description, file, prefix)
+    for field in fields(description):
+        value = getattr(description, field.name)
+        for part in value if isinstance(value, tuple) else (value,):
+            if is_dataclass(part):
+                check_description(part, file, _prefix(prefix, field.name, part))
+
+
+def _prefix(prefix: str, field: str, part: Any) -> str:
+    """Return the beginning of keys for a part of a description, in the words of robot files."""
+    if isinstance(part, Body | Constraint):
+        return f"{part.kind if isinstance(part, Body) else 'constraint'} {part.name!r} "
+    if prefix.endswith(" "):
+        return f"{prefix}{field} "
+    label = next((f"{getattr(part, key)}." for key in ("name", "rotor", "body") if hasattr(part, key)), "")
+    return f"{prefix}{field.removeprefix('drive_')}.{label}"
 
 
 def _check_names(robot: Robot, file: str) -> None:
@@ -189,10 +223,8 @@ def _check_contacts(robot: Robot, file: str) -> None:
         if robot.body(contact.body).kind == "rotor":
             raise invalid_value(file, f"{key}.body", contact.body, "a link, because rotors spin inside transmissions")
         check_finite(file, f"{key}.position", contact.position)
-        check_fields(contact, file, f"{key}.")
         check_axis(file, f"{key}.axis", contact.axis)
     _check_capsules(robot, file)
-    check_fields(robot.material, file, "material.")
 
 
 def _check_capsules(robot: Robot, file: str) -> None:
@@ -202,7 +234,6 @@ def _check_capsules(robot: Robot, file: str) -> None:
         if capsule.body not in links:
             raise unknown_name(file, key, capsule.body, links, "the name of a link")
         check_finite(file, key, (*capsule.start, *capsule.end))
-        check_fields(capsule, file, f"{key} ")
     check_unique(file, "self_collisions", [" and ".join(sorted(pair)) for pair in robot.self_collisions])
     for pair in robot.self_collisions:
         for name in pair:
@@ -217,7 +248,6 @@ def _check_capsules(robot: Robot, file: str) -> None:
 
 
 def _check_pose_and_gains(robot: Robot, file: str) -> None:
-    check_fields(robot.pose, file, "pose.")
     check_finite(file, "gravity", robot.gravity)
     _check_joint_values(robot, file, "pose.joints", robot.pose.joints)
     check_unique(file, "pose.balls", [name for name, _ in robot.pose.balls])
