@@ -33,7 +33,8 @@ class Record:
     """One recorded control step.
 
     Attributes:
-        arrays: State before the step, and its clock, by name of the buffer.
+        arrays: State before the step, by name of the buffer.
+        versions: Version before the step of each part of the state that passes a gradient, see `Batch.version`.
         counters: Counters of the random streams before the step.
         action: Action, shape (num_envs, n_actions).
         ignored: Robots that were reset instead of stepped, shape (num_envs,).
@@ -41,6 +42,7 @@ class Record:
     """
 
     arrays: dict[str, NDArray]
+    versions: dict[str, NDArray[np.int64]]
     counters: NDArray
     action: NDArray
     ignored: NDArray
@@ -51,8 +53,8 @@ class DifferentiableEnv:
     """Control steps of an environment with gradients of sub-steps, observations and rewards.
 
     Gradients hold the active set of the step fixed: contacts that touch or stick, active limits, branches of terms.
-    They do not pass the end or the start of an episode. A robot that diverged, or halved a sub-step (see `Simulator`),
-    has a gradient of zero.
+    They do not pass the end or the start of an episode, a call that sets the state, or steps that are not recorded. A
+    robot that diverged, or halved a sub-step (see `Simulator`), has a gradient of zero.
 
     Args:
         env: An unwrapped environment of this package on the CPU, with flat ground and without latency.
@@ -85,10 +87,10 @@ class DifferentiableEnv:
             raise ValueError(f"largest={largest!r}; expected a number above 0")
         gradient = ControlStepGradient(self.batch.program)
         self._kernel = load_kernel(f"control step gradient {kernel_key(self.batch.program)}", gradient.program, dtype)
-        self._recorded = [name for name in (*self._kernel.buffers, "clock") if name in self.batch.schema]
+        self._recorded = [name for name in self._kernel.buffers if name in self.batch.schema]
         self._weights = gradient.weights
         self._carried = {weight.name: place.tiles(n, weight.size, dtype) for weight in self._weights.values()}
-        self._following = np.full(n, -1.0)  # clock of the control step that was differentiated last
+        self._following = dict.fromkeys(self._weights, np.full(n, -1))  # versions before the step differentiated last
         self._records, self._spare = list[Record](), list[dict[str, NDArray]]()
 
     @property
@@ -104,13 +106,14 @@ class DifferentiableEnv:
             array[...] = batch.arrays[name]
         counters, ignored = batch.arrays["counters"].copy(), batch.arrays["finished"].copy()
         retries = batch.arrays["retries"].copy()
+        versions = {name: batch.version(name) for name in self._weights}
         result = self.env.step(actions)
         arrays["diverged"][batch.arrays["retries"] > retries] = 1  # halved sub-steps are not differentiated
         action = (
             np.clip(actions, -2, 2).astype(np.float32).reshape(batch.num_envs, -1)
         )  # keeps actions beyond 1 beyond 1
         replaced = np.reshape(np.logical_or(result[2], result[3]), -1) & same_step
-        self._records.append(Record(arrays, counters, action, ignored, replaced))
+        self._records.append(Record(arrays, versions, counters, action, ignored, replaced))
         return result
 
     def backward(
@@ -143,16 +146,19 @@ class DifferentiableEnv:
         rewards[:, 0] = by_reward
         if record.ignored.any():
             rows, rewards = rows * ~record.ignored[:, None], rewards * ~record.ignored[:, None]
-        clock = self.batch.place.read(record.arrays["clock"], n)[:, 0]
+        for name, version in record.versions.items():
+            follows = self._following[name] == version + 1  # a step changes the state once, and a reset in it again
+            if not follows.all():
+                self.batch.place.write(self._carried[self._weights[name].name], 0.0, ~follows)
         control = np.empty((n, 2), dtype)
-        control[:, 0] = (self._following == clock + 1) & ~record.ignored
+        control[:, 0] = ~record.ignored
         control[:, 1] = min(self.largest, float(np.finfo(dtype).max))
         result = np.empty((n, self.batch.program.n_actions), dtype)
         arrays = {"action_in": record.action, "w_observation": rows, "w_reward": rewards}
         arrays |= {"control": control, "by_action": result}
         streams = {"keys": self.batch.arrays["keys"].view(np.uint64), "counters": record.counters}
         self._kernel(record.arrays | self._carried | arrays, n, num_threads=self.batch.num_threads, **streams)
-        self._following = np.where(record.ignored, -1.0, clock)
+        self._following = {name: np.where(record.ignored, -1, x) for name, x in record.versions.items()}
         self._spare.append(record.arrays)
         return result
 

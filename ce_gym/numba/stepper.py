@@ -29,6 +29,7 @@ class Robots(NamedTuple):
         diverged: 1 for robots that are frozen, in tiles of size 1.
         arrays: All arguments of the kernel.
         scratch: Memory of the kernel.
+        n_changes: See `Batch.n_changes`; tells recorders of gradients that robots have been stepped.
     """
 
     num_envs: int
@@ -40,6 +41,7 @@ class Robots(NamedTuple):
     diverged: NDArray[Any]
     arrays: tuple[NDArray[Any], ...]
     scratch: NDArray[np.int64]
+    n_changes: NDArray[np.int64]
 
 
 def stepper(simulator: Simulator) -> tuple[Robots, Callable[[Robots, int], None]]:
@@ -60,12 +62,14 @@ def stepper(simulator: Simulator) -> tuple[Robots, Callable[[Robots, int], None]
     views = {name: arrays.get(name, nothing) for name in ("q", "v", "target", "torque", "contact_forces", "diverged")}
     passed = tuple(arrays[buffer.name] for buffer in kernel.arguments)
     scratch = np.zeros(scratch_size(kernel), np.int64)
-    robots = Robots(simulator.num_envs, **views, arrays=passed, scratch=scratch)
+    changes = simulator._batch.n_changes
+    robots = Robots(simulator.num_envs, **views, arrays=passed, scratch=scratch, n_changes=changes)
     call, lanes = kernel_call(kernel), kernel.lanes
 
     @njit(nogil=True)
     def step(robots, n_substeps):
         """Advance all robots by `n_substeps` sub-steps of length `dt`."""
+        robots.n_changes[:] += 1
         n_tiles = -(-robots.num_envs // lanes)
         for made in range(0, n_substeps, LONGEST):
             call(robots.arrays, robots.scratch, min(LONGEST, n_substeps - made), 0, n_tiles, robots.num_envs)

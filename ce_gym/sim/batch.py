@@ -43,6 +43,7 @@ class Batch:
         schema: Rows by name.
         arrays: Arrays of the rows, by name.
         tables: Arrays that all robots share, by name.
+        n_changes: How often steps and resets have changed the state of each robot, int64, shape (num_envs,).
     """
 
     def __init__(
@@ -61,6 +62,8 @@ class Batch:
         self.num_envs, self.dtype, self.place, self.num_threads = num_envs, dtype, device, num_threads
         self.arrays = {name: self._array(row) for name, row in self.schema.items()}
         self.tables: dict[str, Array] = {}
+        self.n_changes = np.zeros(num_envs, np.int64)
+        self._n_writes = {name: np.zeros(num_envs, np.int64) for name in self.schema}
         if terrain is not None:
             self.tables[HEIGHTS] = device.rows(terrain.heights.astype(dtype), dtype)
             self.write(FRAME, [*terrain.origin, terrain.cell])
@@ -87,6 +90,11 @@ class Batch:
             mask: Robots to write, bool, shape (num_envs,); all robots if None.
         """
         self.place.write(self.arrays[name], values, mask)
+        self._n_writes[name] += mask if isinstance(mask, np.ndarray) else True
+
+    def version(self, name: str) -> NDArray[np.int64]:
+        """Return numbers that grow whenever a state buffer of a robot may have changed, shape (num_envs,)."""
+        return self.n_changes + self._n_writes[name]
 
     def unit(self, name: str, values: NDArray, source: str = "") -> NDArray:
         """Return rows of a state buffer, shape (..., size), with quaternions scaled to unit length.

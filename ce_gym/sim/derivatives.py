@@ -38,16 +38,16 @@ class Record:
 
     Attributes:
         arrays: State before the first sub-step.
-        kept: Robots that started from the end of the previous record, shape (num_envs,); None for all robots.
+        kept: For each part of the state, robots that started from the end of the previous record, shape (num_envs,).
         targets: Target of each sub-step.
-        after: Positions and velocities after the last sub-step, which show later whether a robot has been set since.
+        after: For each part of the state its version after the last sub-step, see `Batch.version`.
         in_parts: For each sub-step the robots that halved it, shape (num_envs,); None if no robot did.
     """
 
     arrays: dict[str, NDArray]
-    kept: NDArray | None = None
+    kept: dict[str, NDArray[np.bool_]]
     targets: list[NDArray] = field(default_factory=list)
-    after: dict[str, NDArray] = field(default_factory=dict)
+    after: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     in_parts: list[NDArray | None] = field(default_factory=list)
 
 
@@ -123,12 +123,12 @@ class StepDerivatives:
             last = self._records[-1] if self._records else None
             if last is None or len(last.targets) >= self._keep_every or not self._is_as_left(last):
                 arrays = {name: aligned_copy(simulator._arrays[name]) for name in self._kept}
-                self._records.append(Record(arrays, None if last is None else self._where_left(last)))
+                self._records.append(Record(arrays, {} if last is None else self._where_left(last)))
             retries = simulator._batch.rows("retries")
             simulator.step(rows, 1)
             record = self._records[-1]
             record.targets.append(rows)
-            record.after = {name: simulator._arrays[name].copy() for name in ("q", "v")}
+            record.after = self._versions()
             parts = (simulator._batch.rows("retries") > retries).reshape(simulator.num_envs)
             record.in_parts.append(parts if parts.any() else None)
 
@@ -167,7 +167,8 @@ class StepDerivatives:
     ) -> tuple[dict[str, NDArray], list[NDArray], NDArray]:
         """Propagate a gradient back through all recorded sub-steps, and delete the record.
 
-        The gradient of a robot stops where the robot was reset or set, or diverged.
+        The gradient of a robot stops where the robot was reset or set, was stepped without a record, or diverged. Where
+        only parts of its state were set, by `restore`, it stops for these parts.
 
         Args:
             weights: Gradient of a quantity with respect to parts of the last state, shape (num_envs, size), see
@@ -193,9 +194,9 @@ class StepDerivatives:
                     for name, rows in self._through_parts(arrays, target, after, parts).items():
                         _overwrite((now | others)[name], rows, parts)
                 parameters += others["parameters"]
-            if record.kept is not None:
-                for array in now.values():
-                    write_rows(array, 0.0, ~record.kept)
+            for name, kept in record.kept.items():
+                if not kept.all():
+                    write_rows(now[name], 0.0, ~kept)
         return self._rows(now, n), list(targets), parameters
 
     def gradient(self, target: ArrayLike, weights: Mapping[str, ArrayLike]) -> dict[str, NDArray]:
@@ -318,14 +319,14 @@ class StepDerivatives:
         """Return whether robots and their parameters have not been set since the record."""
         now = self.simulator._arrays
         figures = np.array_equal(now["parameters"], record.arrays["parameters"]) if "parameters" in now else True
-        return figures and all(np.array_equal(now[name], array) for name, array in record.after.items())
+        return figures and all(kept.all() for kept in self._where_left(record).values())
 
-    def _where_left(self, record: Record) -> NDArray | None:
-        """Return which robots are at the end of a record, shape (num_envs,); None for all robots."""
-        now, n = self.simulator._arrays, self.simulator.num_envs
-        read = self.simulator._device.read
-        same = [(read(now[name], n) == read(array, n)).all(axis=1) for name, array in record.after.items()]
-        return None if np.all(same) else np.all(same, axis=0)
+    def _where_left(self, record: Record) -> dict[str, NDArray[np.bool_]]:
+        """Return for each part of the state which robots are at the end of a record, shape (num_envs,)."""
+        return {name: version == record.after[name] for name, version in self._versions().items()}
+
+    def _versions(self) -> dict[str, NDArray[np.int64]]:
+        return {name: self.simulator._batch.version(name) for name in self._parts}
 
     def _states(self, record: Record) -> list[tuple[dict[str, NDArray], NDArray]]:
         """Return the state before each sub-step of a record and its target; all states but the first are recomputed."""

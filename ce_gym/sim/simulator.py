@@ -232,6 +232,7 @@ class Simulator:
         keep = is_long(n_substeps)
         before = {name: self._device.copy(array) for name, array in self._arrays.items()} if keep else {}
         arrays = self._arrays | self._batch.tables | given
+        self._batch.n_changes += n_substeps > 0
         try:
             run_substeps(
                 self._kernel, arrays, self.num_envs, n_substeps, self._section, self.num_threads, self._addresses

@@ -126,6 +126,35 @@ def test_an_episode_that_ends_passes_nothing_on(env):
     assert not final[4:].any()
 
 
+@pytest.mark.parametrize("change", ["restore", "step", "reset of some", "command"])
+def test_gradients_stop_where_the_state_was_set(change: str):
+    """The clock goes on as if nothing had happened; a command alone is no part of the motion."""
+    env = make("Disabled")
+    env.reset(seed=1)
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (4, N, ACTIONS)).astype(np.float32)
+    env.step(actions[0])
+    env.step(actions[1])
+    kept = env.snapshot()
+    env.reset(seed=2)
+    differentiable, some = env.differentiable(), np.arange(N) < 4
+    differentiable.step(actions[2])
+    if change == "step":
+        env.step(actions[3])
+    else:
+        differentiable.step(actions[3])
+    if change == "restore":
+        env.restore(kept)
+    elif change == "reset of some":
+        env.reset(options={"reset_mask": some})
+    elif change == "command":
+        env.set_command(np.zeros(3))
+    differentiable.step(actions[0])
+    assert differentiable.backward(by_reward=np.ones(N)).any(axis=1).all()
+    rows = differentiable.backward().any(axis=1)
+    cut = {"reset of some": some, "command": np.zeros(N, bool)}.get(change, np.ones(N, bool))
+    np.testing.assert_array_equal(rows, ~cut)
+
+
 def test_a_reset_in_the_next_step_ignores_its_action():
     env = make("NextStep")
     differentiable = env.differentiable()

@@ -64,7 +64,9 @@ def test_a_ratio_that_leaves_no_digits_is_refused(ratio: float):
     if ratio == 1e6:
         Model(robot)
     else:
-        with pytest.raises(RobotError, match=r"eigenvalues from .* \(a\) to .* \(b\): expected a ratio of at most 1e\+14"):
+        with pytest.raises(
+            RobotError, match=r"eigenvalues from .* \(a\) to .* \(b\): expected a ratio of at most 1e\+14"
+        ):
             Model(robot)
 
 

@@ -266,6 +266,52 @@ def test_resets_and_diverged_robots_pass_nothing_on():
     assert not targets[1][1].any()
 
 
+CHANGES = {
+    "its own state": lambda sim, derivatives: sim.set_state(sim.q, sim.v),
+    "its own snapshot": lambda sim, derivatives: sim.restore(sim.snapshot()),
+    "its own parts": lambda sim, derivatives: derivatives.restore(derivatives.state()),
+    "a step without a record": lambda sim, derivatives: sim.step(np.zeros(2)),
+    "a reset": lambda sim, derivatives: sim.reset(),
+}
+
+
+@pytest.mark.parametrize("keep_every", [1, 100])
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_gradients_stop_at_each_change_of_the_state(change, keep_every: int):
+    """Also at one that leaves positions and velocities, where contacts keep or lose their memory."""
+    (sim, target), weights = standing(3), {"v": np.ones((3, 8))}
+    derivatives, later = StepDerivatives(sim, keep_every), StepDerivatives(sim)
+    derivatives.step(target, 3)
+    change(sim, derivatives)
+    for recorder in (derivatives, later):
+        state = sim.snapshot()
+        recorder.step(target, 2)
+        if recorder is derivatives:
+            sim.restore(state)
+    (before, targets, _), (_, expected, _) = derivatives.backward(weights), later.backward(weights)
+    np.testing.assert_array_equal(targets[3:], expected)
+    assert not any(rows.any() for rows in (*targets[:3], *before.values()))
+
+
+def test_gradients_pass_a_change_of_other_parts():
+    """Robots whose velocities were set keep the gradient to their positions; another parameter cuts nothing."""
+    model = Model("planar_leg_linkage")
+    sim = Simulator(model, 2, parameters=("kp",))
+    derivatives = StepDerivatives(sim)
+    derivatives.step(model.standing_q)
+    derivatives.restore({"v": sim.v})
+    A, _ = derivatives.linearize(model.standing_q)
+    derivatives.step(model.standing_q)
+    set_v, *_ = derivatives.backward({"q": np.ones((2, 2))})
+    sim.reset()
+    B, _ = derivatives.linearize(model.standing_q)
+    np.testing.assert_allclose(set_v["q"][0], (A[0, :2, :2].sum(0)) @ B[0, :2, :2], rtol=1e-9)
+    derivatives.step(model.standing_q)
+    sim.set_parameter("kp", 2 * sim.snapshot()["parameters"])
+    derivatives.step(model.standing_q)
+    assert derivatives.backward({"q": np.ones((2, 2))})[0]["q"].all()
+
+
 def test_gradient_to_parameters():
     model = Model("planar_leg_linkage")
     sim = Simulator(model, 2, parameters=("kp", "kd"))

@@ -123,6 +123,7 @@ class TaskBatch(Batch):
         return self._reset(mask)
 
     def _reset(self, mask: Array) -> Array:
+        self.n_changes += mask if isinstance(mask, np.ndarray) else True
         observation = self.place.copy(self.arrays["observation"])
         if self.fused:
             self._run(self._reset_kernel, {"observation": observation})
@@ -145,6 +146,7 @@ class TaskBatch(Batch):
         """
         rows = {name: self.place.empty(shape, dtype) for name, shape, dtype in self._results}
         kept = {name: self.rows(name) for name in self._kept_if_ignored} if ignored is not None else {}
+        self.n_changes += 1
         self._run(self._step_kernel, {**rows, "action_in": action}, {"n_substeps": self.program.task.n_substeps})
         if not self.fused:
             self.arrays["counters"] += 1 if ignored is None else ~ignored
