@@ -228,8 +228,9 @@ class _LinearizationCalls:
         self.linear, self.n = linear, n
         self.iterate, self.first = linear.iteration_function(), linear.solve_function(first=True)
         self.solve, self.end = linear.solve_function(), linear.end_function()
-        self.drift = linear.drift_function() if linear.turned else None
-        self.pressed_drift = linear.pressed_drift_function() if linear.turned and linear.local else None
+        drifts = bool(linear.drift.nnz())
+        self.drift = linear.drift_function() if drifts else None
+        self.pressed_drift = linear.pressed_drift_function() if drifts and linear.local else None
         self.gains = linear.gains_function() if linear.chained else None
         self.pass_on = linear.pass_on_function() if linear.chained else None
         self.changes = [linear.change_function(group) for group in linear.groups]

@@ -87,7 +87,7 @@ class Linearization(Equation):
 
     @cached_property
     def _factor(self) -> ca.Sparsity:
-        return self.implicit().sparsity()
+        return factorised(self.implicit(), self.order).sparsity()
 
     def iteration_function(self) -> ca.Function:
         """Trace an iteration, and the part of its derivative that all directions share.
