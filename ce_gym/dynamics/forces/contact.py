@@ -42,6 +42,8 @@ from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.recursion.kinematics import BodyState, constant
 from ce_gym.model.description import ContactSphere
 
+RELEASES = 4
+"""Iterations in which contacts that pull are released, after those of friction."""
 FORCE_FLOOR = 1e-6
 """Pull that counts as none [N]."""
 TINY_SPEED = 1e-9
@@ -192,6 +194,11 @@ class Iterate:
         """1 if two iterations have not converged, so that the next must be safe."""
         return self.count > 1.5
 
+    @property
+    def releases(self) -> SX:
+        """1 if a safe iteration has not converged either, so that contacts may only be released."""
+        return self.count > 2.5
+
 
 @dataclass
 class Contact:
@@ -243,12 +250,13 @@ class LinearContact:
         t, last = law.touch, iterate.last
         force, slope = law.normal.force(t, law.compliance, law.dt)
         before, after = self._closing(SX(3, 1)), self._closing(iterate.gain)
-        pushes = ca.logic_or(force - slope * before > 0, force - slope * after > 0)
-        share = self._share(before, after)
-        self._above = t.depth <= 0
-        self.active = ca.if_else(
-            self._above, ca.logic_and(share > 0, ca.logic_or(pushes, last)), ca.logic_or(t.load > 0, pushes)
-        )
+        pushed, pushes = force - slope * before > 0, force - slope * after > 0
+        share, first = self._share(before, after), iterate.count < 0.5
+        self._above, self._law_force, self._law_slope = t.depth <= 0, force, slope
+        above = ca.logic_and(share > 0, ca.logic_or(ca.logic_or(pushed, pushes), last))
+        inside = ca.if_else(first, ca.logic_or(t.load > 0, pushed), pushes)
+        kept = ca.logic_and(iterate.active, ca.if_else(self._above, after < 0, pushes))
+        self.active = ca.if_else(iterate.releases, kept, ca.if_else(self._above, above, inside))
         damped = ca.logic_and(self._above, last)
         self.normal_force = ca.if_else(ca.logic_and(self.active, ca.logic_not(damped)), force, 0)
         self.normal_slope = ca.if_else(self.active, ca.if_else(damped, share * slope, slope), 0)
@@ -318,15 +326,16 @@ class LinearContact:
     def check(self, motion: Motion) -> SX:
         """Return 1 if the active set is not the one that was assumed; else 0.
 
-        Friction says otherwise, an inactive contact is in the ground, or one above it was pulled down. The last
-        iteration is never checked: there is nothing safer to try.
+        Friction says otherwise, an inactive contact would push, or an active one pulls. Safe iterations are only
+        checked for contacts that pull.
         """
-        gain = self.gain(motion)
-        slid = self.law.friction.check(self, self.slip, gain)
-        arrived = self.law.touch.depth - self.law.dt * self._closing(gain) > 0
-        pulled = ca.logic_and(self._above, self.normal_after(gain) < -FORCE_FLOOR)
-        changed = ca.logic_or(slid, ca.if_else(self.active, pulled, arrived))
-        return where(self.law.near, ca.logic_and(changed, ca.logic_not(self.iterate.last)))
+        gain, depth = self.gain(motion), self.law.touch.depth
+        slid, closing = self.law.friction.check(self, self.slip, gain), self._closing(gain)
+        pushes = self._law_force - self._law_slope * closing > 0
+        arrived = ca.if_else(self._above, depth - self.law.dt * closing > 0, pushes)
+        pulls = ca.logic_and(self.active, self.normal_after(gain) < -FORCE_FLOOR)
+        changed = ca.logic_or(slid, ca.if_else(self.active, pulls, arrived))
+        return where(self.law.near, ca.if_else(self.iterate.last, pulls, changed))
 
     def next_iterate(self, motion: Motion) -> SX:
         """Return the iterate for another iteration, shape (Iterate.SIZE,)."""

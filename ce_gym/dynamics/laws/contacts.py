@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
-from ce_gym.dynamics.forces.contact import Compliance, Contact, LinearContact, touch_ground, where
+from ce_gym.dynamics.forces.contact import RELEASES, Compliance, Contact, LinearContact, touch_ground, where
 from ce_gym.dynamics.forces.friction import FRICTION
 from ce_gym.dynamics.forces.linear import Motion
 from ce_gym.dynamics.forces.normal import normal_law
@@ -52,7 +52,7 @@ class Contacts(ForceLaw):
             Field("anchor", bristles, "m", "horizontal deflection of each bristle, world axes", explicit=True),
         )
         self.output_sizes = {"contact_forces": 3 * len(options.contacts)}
-        self.size, self.iterations = Contact.size * n, FRICTION[options.friction].iterations
+        self.size, self.iterations = Contact.size * n, FRICTION[options.friction].iterations + RELEASES
         seldom = [i for i, name in enumerate(options.touches) if name in options.seldom]
         self.culled_rows = [Contact.size * i + j for i in seldom for j in range(Contact.size)]
 
