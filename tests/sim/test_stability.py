@@ -17,6 +17,36 @@ def cheetah() -> Model:
     return Model("mini_cheetah")
 
 
+@pytest.mark.parametrize("method", ["euler", "extrapolated", "adaptive"])
+@pytest.mark.parametrize("robot", ["block", "tripod"])
+def test_contacts_never_pull(robot: str, method: str):
+    """Robots at rest that are set in upward motion fly away; thrown robots, some in the ground, are only pushed."""
+    model, n, rng = Model(mechanisms.block() if robot == "block" else TRIPOD), 24, np.random.default_rng(1)
+    sim = Simulator(model, n, method=method, outputs=("contact_forces", "energy"))
+    target, up = model.standing_q[7:], np.zeros(model.nv)
+    sim.step(target, 200)
+    up[5] = 1.0
+    sim.set_state(sim.q, up)
+    sim.step(target)
+    np.testing.assert_allclose(sim.v[:, 5], 1.0 - 9.81 * sim.dt, atol=0.02)
+    q = np.tile(model.standing_q, (n, 1))
+    q[:, 2] += rng.uniform(-0.1, 0.2, n)
+    q[:, 3:7] = rng.normal(size=(n, 4))
+    q[:, 3:7] /= np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
+    sim.set_state(q, rng.normal(0, 1.5, (n, model.nv)))
+    sim.step(target)
+    touched = 0
+    for _ in range(60):
+        before = sim.energy
+        sim.step(target)
+        assert sim.contact_forces[..., 2].min() >= -1e-5
+        touched += sim.contact_forces.any(axis=(1, 2)).sum()
+        if robot == "block" and method == "euler":
+            assert (sim.energy <= before + 1e-9 * np.abs(before)).all()
+    assert touched > n
+    assert not sim.diverged.any()
+
+
 @pytest.mark.slow
 def test_a_chain_of_many_rods_swings():
     """For half a second from horizontal, on undamped joints: Euler's gain of energy stays below a tenth of its fall."""

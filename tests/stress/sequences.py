@@ -140,6 +140,9 @@ class Simulators(Beside):
         """Make calls that must be refused."""
         expect_refusal(lambda: self.batch.step(np.full(len(self.model.robot.independent), np.nan)))
         expect_refusal(lambda: self.batch.set_state(np.zeros(self.model.nq + 1), np.zeros(self.model.nv)))
+        for mask in (np.arange(N), np.ones(N), np.full(N, np.nan), [None] * N, "all", np.ones(N + 1, bool)):
+            expect_refusal(lambda mask=mask: self.batch.reset(mask))
+        expect_refusal(lambda: self.batch.step(self.model.standing_q[self.model.robot.layout.joints_q :] + 0j))
 
     def check(self) -> None:
         """Compare, and look for numbers that are not finite."""
@@ -192,6 +195,8 @@ class Environments(Beside):
         """Make calls that must be refused."""
         expect_refusal(lambda: self.batch.step(np.full(self.batch.action_space.shape, np.nan)))
         expect_refusal(lambda: self.batch.reset(options={"reset_mask": np.ones(N + 1, bool)}))
+        for steps in (np.nan, np.inf, -5, 0.5, "0", np.zeros(N + 1)):
+            expect_refusal(lambda steps=steps: setattr(self.batch, "elapsed_steps", steps))
 
     def close(self, rng: np.random.Generator) -> None:
         """Close the batch, which then refuses to step, and go on with another one in the same state."""

@@ -20,7 +20,12 @@ second iteration. A point that is turned back before it reaches the surface woul
 third iteration, in which the damper `-share (c + dt k) v_n+` replaces the spring and can do no work. `share = 1 - d /
 (dt v_n)` is the part of the step that the point spends in the ground. The prediction knows the velocity but not yet the
 acceleration: a loaded foot that its spring has just lifted would be taken to be gone, fall back, and bounce on the
-steps for ever. So a contact that pushed at the end of the last step stays active while it is in the ground.
+steps for ever. So a contact that pushed at the end of the last step is active in the first iteration while it is in the
+ground.
+
+A force never pulls. After the first iteration, a contact in the ground is active if its law pushes at the velocity that
+the iteration before found: the primal-dual active set method (Hintermueller, Ito and Kunisch 2002). If three iterations
+have not converged, up to `RELEASES` more release contacts that pull and make none active, which must end.
 
 In the step in which a point lands, damping acts over the whole step, although the point is in the ground only for a
 share of it, and friction has no load yet. Both are errors of first order in the step. Methods with `resolves_landing`
