@@ -119,7 +119,7 @@ def wheel() -> Model:
     """A driven wheel on the world."""
     inertia = ((1e-3, 0.0, 0.0), (0.0, 1e-3, 0.0), (0.0, 0.0, 1e-3))
     joint = Joint("revolute", (0.0, 0.0, 1.0))
-    body = Body("wheel", "link", None, Placement(), joint, Inertial(1.0, (0.0, 0.0, 0.0), inertia))
+    body = Body("wheel", "rotor", None, Placement(), joint, Inertial(1.0, (0.0, 0.0, 0.0), inertia))
     return Model(Robot("wheel", (body,), (), ("wheel",), motors=(Motor("wheel"),)))
 
 
