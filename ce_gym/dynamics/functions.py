@@ -6,13 +6,12 @@ sub-expressions.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import casadi as ca
-import numpy as np
 
 from ce_gym.dynamics.algebra.integration import difference, integrate
-from ce_gym.dynamics.algebra.spatial import SX, cross
+from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.algebra.tracing import traced
 from ce_gym.dynamics.constraints.assembly import linear_rows, nonlinear_rows
 from ce_gym.dynamics.constraints.closure import closures
@@ -22,11 +21,10 @@ from ce_gym.dynamics.quantities.inputs import function_of_state, state_symbols
 from ce_gym.dynamics.quantities.momentum import MOMENTUM_FUNCTIONS
 from ce_gym.dynamics.recursion.ce_aba import (
     JointTerms,
-    gravity_acceleration,
     inward_inertia_pass,
     outward_acceleration_pass,
 )
-from ce_gym.dynamics.recursion.ce_rnea import inverse_dynamics, outward_acceleration
+from ce_gym.dynamics.recursion.ce_rnea import inverse_dynamics
 from ce_gym.dynamics.recursion.derived import (
     external_wrenches,
     guessed_coordinates,
@@ -162,18 +160,6 @@ def _body_poses(mechanism: Mechanism) -> ca.Function:
     return function_of_state("body_poses", guess, {"q": q}, {"positions": positions, "rotations": rotations})
 
 
-def _contact_points(mechanism: Mechanism) -> ca.Function:
-    q, v, guess = state_symbols(mechanism)
-    kinematics = outward_velocity_pass(mechanism, q, v, guess)
-    positions, velocities = [SX(3, 0)], [SX(3, 0)]
-    for contact in mechanism.robot.contacts:
-        body, r = kinematics.bodies[contact.body], constant(np.array(contact.position))
-        positions.append(body.point_position(r))
-        velocities.append(body.R @ body.point_velocity(r))
-    outputs = {"positions": ca.horzcat(*positions), "velocities": ca.horzcat(*velocities)}
-    return function_of_state("contact_points", guess, {"q": q, "v": v}, outputs)
-
-
 def _body_velocities(mechanism: Mechanism) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
@@ -183,20 +169,6 @@ def _body_velocities(mechanism: Mechanism) -> ca.Function:
         "linear": ca.horzcat(*[motion.v for motion in motions]),
     }
     return function_of_state("body_velocities", guess, {"q": q, "v": v}, outputs)
-
-
-def _contact_accelerations(mechanism: Mechanism) -> ca.Function:
-    q, v, guess = state_symbols(mechanism)
-    vdot = SX.sym("vdot", v.shape[0])
-    kinematics = outward_velocity_pass(mechanism, q, v, guess)
-    a_bodies, _ = outward_acceleration(mechanism, kinematics, vdot)
-    gravity, accelerations = gravity_acceleration(mechanism), [SX(3, 0)]
-    for contact in mechanism.robot.contacts:
-        body, a, r = kinematics.bodies[contact.body], a_bodies[contact.body], constant(np.array(contact.position))
-        in_body_axes = a[3:] + cross(a[:3], r) + cross(body.v[:3], cross(body.v[:3], r))
-        accelerations.append(body.R @ in_body_axes + gravity)
-    outputs = {"accelerations": ca.horzcat(*accelerations)}
-    return function_of_state("contact_accelerations", guess, {"q": q, "v": v, "vdot": vdot}, outputs)
 
 
 def _energy(mechanism: Mechanism) -> ca.Function:
@@ -229,29 +201,38 @@ FUNCTIONS: dict[str, Callable[[Mechanism], ca.Function]] = {
     "loops": _loops,
     "body_poses": _body_poses,
     "body_velocities": _body_velocities,
-    "contact_points": _contact_points,
-    "contact_accelerations": _contact_accelerations,
     "energy": _energy,
     "integrate": _integrate,
     "difference": _difference,
-    **CONTACT_FUNCTIONS,
     **MOMENTUM_FUNCTIONS,
     **FORCE_FUNCTIONS,
 }
 
 
 def trace(mechanism: Mechanism, name: str) -> ca.Function:
-    """Trace a quantity: one of `FUNCTIONS`, or one of a frame, `"frame_jacobian:FRAME"`.
+    """Trace a quantity: of `FUNCTIONS`, of a frame, or of contacts, all or by name.
+
+    Names are such as "mass_matrix", "frame_jacobian:FRAME", "contact_jacobian" and "contact_jacobian:CONTACT,CONTACT".
 
     Raises:
-        KeyError: If there is no such quantity or frame.
+        KeyError: If there is no such quantity, frame or contact.
     """
-    kind, _, frame = name.partition(":")
+    kind, colon, place = name.partition(":")
     if kind in FRAME_FUNCTIONS:
-        if frame not in (frames := frames_of(mechanism)):
-            raise KeyError(f"no frame {frame!r} for {kind!r}; expected one of {listed_names(frame, frames)}")
-        return FRAME_FUNCTIONS[kind](mechanism, frame)
+        _check_known("frame", place, kind, frames_of(mechanism))
+        return FRAME_FUNCTIONS[kind](mechanism, place)
+    if kind in CONTACT_FUNCTIONS:
+        contacts = {contact.name: contact for contact in mechanism.robot.contacts}
+        names = place.split(",") if place else [] if colon else [*contacts]
+        for contact in names:
+            _check_known("contact", contact, kind, contacts)
+        return CONTACT_FUNCTIONS[kind](mechanism, [contacts[contact] for contact in names])
     if name not in FUNCTIONS:
-        known = [*FUNCTIONS, *(f"{kind}:FRAME" for kind in FRAME_FUNCTIONS)]
+        known = [*FUNCTIONS, *CONTACT_FUNCTIONS, *(f"{kind}:FRAME" for kind in FRAME_FUNCTIONS)]
         raise KeyError(f"no function {name!r}; expected one of {listed_names(name, known)}")
     return FUNCTIONS[name](mechanism)
+
+
+def _check_known(what: str, name: str, quantity: str, known: Iterable[str]) -> None:
+    if name not in known:
+        raise KeyError(f"no {what} {name!r} for {quantity!r}; expected one of {listed_names(name, known)}")

@@ -175,10 +175,13 @@ class Model:
                 - "body_velocities": (q, v) -> angular (3, n), linear (3, n).
                 - "contact_points": (q, v) -> positions (3, n), velocities (3, n).
                 - "contact_accelerations": (q, v, vdot) -> accelerations (3, n).
+                - "contact_jacobian": q -> J (3 n, nv).
+                - "contact_bias_acceleration": (q, v) -> accelerations (3, n).
+                - "contact_points:CONTACT,CONTACT" and so on: the same of some contacts, in this order.
                 - "energy": (q, v) -> kinetic, potential.
                 - "frame_pose:FRAME", "frame_jacobian:FRAME": q -> position, rotation; J.
                 - "frame_velocity:FRAME", "frame_bias_acceleration:FRAME": (q, v) -> the method's result.
-                - "contact_jacobian", "center_of_mass", "center_of_mass_jacobian", "centroidal_momentum_matrix",
+                - "center_of_mass", "center_of_mass_jacobian", "centroidal_momentum_matrix",
                   "gravity_force": q -> the method's result.
                 - "center_of_mass_velocity", "center_of_mass_bias_acceleration", "centroidal_momentum",
                   "centroidal_momentum_bias", "coriolis_matrix": (q, v) -> the method's result.
@@ -401,20 +404,31 @@ class Model:
         angular, linear = self.evaluate("body_velocities", q, v)
         return np.swapaxes(angular, -1, -2), np.swapaxes(linear, -1, -2)
 
-    def contact_points(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
-        """Return centres [m] and velocities [m/s] of the contact spheres in the world, each shape (..., n, 3).
+    def contact_points(self, q: ArrayLike, v: ArrayLike, contacts: Sequence[str] | None = None) -> tuple[Array, Array]:
+        """Return centres [m] and velocities [m/s] of contact spheres in the world, each shape (..., n, 3).
 
         For a sphere that moves around a rim, the centre and velocity of the rim.
+
+        Args:
+            q: Positions, shape (..., nq).
+            v: Velocities, shape (..., nv).
+            contacts: Names of the contacts, some of `contact_names`; all if None.
+
+        Raises:
+            ValueError: If a shape is wrong, a contact does not exist, or a loop does not close at `q`.
         """
-        position, velocity = self.evaluate("contact_points", q, v)
+        position, velocity = self.evaluate(self._of_contacts("contact_points", contacts), q, v)
         return np.swapaxes(position, -1, -2), np.swapaxes(velocity, -1, -2)
 
-    def contact_accelerations(self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike) -> Array:
-        """Return the accelerations of the centres of the contact spheres in the world, shape (..., n, 3) [m/s^2].
+    def contact_accelerations(
+        self, q: ArrayLike, v: ArrayLike, vdot: ArrayLike, contacts: Sequence[str] | None = None
+    ) -> Array:
+        """Return the accelerations of the centres of contact spheres in the world, shape (..., n, 3) [m/s^2].
 
         Second derivatives of their positions, for the acceleration `vdot` (..., nv): a robot at rest has none.
+        `contacts` are as in `contact_points`.
         """
-        return np.swapaxes(self.evaluate("contact_accelerations", q, v, vdot)[0], -1, -2)
+        return np.swapaxes(self.evaluate(self._of_contacts("contact_accelerations", contacts), q, v, vdot)[0], -1, -2)
 
     def energy(self, q: ArrayLike, v: ArrayLike) -> tuple[Array, Array]:
         """Return kinetic and potential energy [J], each shape (...)."""
@@ -482,17 +496,36 @@ class Model:
             check_names("frame", [frame], self.frame_names, f"a frame of {self.robot.name}:")
         return f"{quantity}:{frame}"
 
-    def contact_jacobian(self, q: ArrayLike) -> Array:
-        """Return the Jacobians of the centres of the contact spheres, shape (..., n, 3, nv).
+    def contact_jacobian(self, q: ArrayLike, contacts: Sequence[str] | None = None) -> Array:
+        """Return the Jacobians of the centres of contact spheres, shape (..., n, 3, nv).
 
         `J v` are the velocities that `contact_points` returns, in the axes of the world.
-        """
-        J = self.evaluate("contact_jacobian", q)[0]
-        return J.reshape(*J.shape[:-2], len(self.contact_names), 3, self.nv)
 
-    def contact_bias_acceleration(self, q: ArrayLike, v: ArrayLike) -> Array:
-        """Return the accelerations of the centres of the contact spheres for `vdot = 0`, shape (..., n, 3) [m/s^2]."""
-        return self.contact_accelerations(q, v, np.zeros(self.nv))
+        Args:
+            q: Positions, shape (..., nq).
+            contacts: Names of the contacts, some of `contact_names`; all if None.
+
+        Raises:
+            ValueError: If a shape is wrong, a contact does not exist, or a loop does not close at `q`.
+        """
+        J = self.evaluate(self._of_contacts("contact_jacobian", contacts), q)[0]
+        return J.reshape(*J.shape[:-2], J.shape[-2] // 3, 3, self.nv)
+
+    def contact_bias_acceleration(self, q: ArrayLike, v: ArrayLike, contacts: Sequence[str] | None = None) -> Array:
+        """Return the accelerations of the centres of contact spheres for `vdot = 0`, shape (..., n, 3) [m/s^2].
+
+        `contact_jacobian @ vdot + contact_bias_acceleration` are the `contact_accelerations`. `contacts` are as in
+        `contact_jacobian`.
+        """
+        accelerations = self.evaluate(self._of_contacts("contact_bias_acceleration", contacts), q, v)[0]
+        return np.swapaxes(accelerations, -1, -2)
+
+    def _of_contacts(self, quantity: str, contacts: Sequence[str] | None) -> str:
+        """Return the name of the traced function of a quantity of contacts."""
+        if contacts is None:
+            return quantity
+        check_names("contacts", contacts, self.contact_names, f"a contact of {self.robot.name}:")
+        return f"{quantity}:{','.join(contacts)}"
 
     def center_of_mass(self, q: ArrayLike) -> Array:
         """Return the centre of mass of the robot in the world [m], shape (..., 3)."""

@@ -16,8 +16,8 @@ RADIUS, RATE, LIFT = 0.03, 2 * np.pi, np.array([0, 0, 0.08])  # of the circle [m
 LIFT_OFF = 0.5  # [s]
 
 model = ce_gym.Model("mini_cheetah")
-FEET = [model.contact_names.index(name) for name in ("HR_foot", "HL_foot", "FR_foot", "FL_foot")]  # the last one draws
-HOME = model.contact_points(model.standing_q, np.zeros(model.nv))[0][FEET]
+FEET = ["HR_foot", "HL_foot", "FR_foot", "FL_foot"]  # the last one draws
+HOME, _ = model.contact_points(model.standing_q, np.zeros(model.nv), FEET)
 START = model.center_of_mass(model.standing_q)
 ABOVE_THREE_FEET = np.append(HOME[:3, :2].mean(0), START[2])
 
@@ -33,7 +33,7 @@ def foot_reference(t):
 def desired_acceleration(t, q, v, J):
     """Return the acceleration `vdot` (18,) that follows the references."""
     _, rotation = model.frame_pose(q, "Floating Base")
-    center, feet = model.center_of_mass(q), model.contact_points(q, v)[0][FEET]
+    center, feet = model.center_of_mass(q), model.contact_points(q, v, FEET)[0]
     foot, foot_velocity, foot_acceleration = foot_reference(t)
     share = min(t / LIFT_OFF, 1)
     turn = rotation @ model.difference(q, model.standing_q)[:3]  # to the upright pose, in the axes of the world
@@ -43,14 +43,14 @@ def desired_acceleration(t, q, v, J):
     bias = [
         model.center_of_mass_bias_acceleration(q, v),
         model.frame_bias_acceleration(q, v, "Floating Base")[:3],
-        model.contact_bias_acceleration(q, v)[FEET].ravel(),
+        model.contact_bias_acceleration(q, v, FEET).ravel(),
     ]
     return np.linalg.solve(J, acceleration + KP * error + KD * (velocity - J @ v) - np.concatenate(bias))
 
 
 def control(t, q, v):
     """Return the torques of the joints (12,)."""
-    J_feet = model.contact_jacobian(q)[FEET]
+    J_feet = model.contact_jacobian(q, FEET)
     J_trunk = model.frame_jacobian(q, "Floating Base")[:3]
     J = np.vstack([model.center_of_mass_jacobian(q), J_trunk, *J_feet])
     force = model.inverse_dynamics(q, v, desired_acceleration(t, q, v, J))  # M vdot + h
@@ -69,7 +69,7 @@ def main(duration=3.0):
     for t in np.arange(0, duration, sim.dt):
         q, v = sim.q[0], sim.v[0]
         sim.step(control(t, q, v))
-        errors.append(model.contact_points(q, v)[0][FEET[3]] - foot_reference(t)[0])
+        errors.append(model.contact_points(q, v, FEET)[0][3] - foot_reference(t)[0])
         heights.append(q[2])
     return np.array(errors), np.array(heights)
 

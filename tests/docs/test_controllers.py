@@ -40,7 +40,7 @@ def test_torques_of_the_whole_body_controller():
     model, feet = script["model"], script["FEET"]
     q = model.integrate(model.standing_q, 0.003 * rng.normal(size=model.nv))
     v = 0.01 * rng.normal(size=model.nv)
-    J_feet = model.contact_jacobian(q)[feet]
+    J_feet = model.contact_jacobian(q, feet)
     J = np.vstack([model.center_of_mass_jacobian(q), model.frame_jacobian(q, "Floating Base")[:3], *J_feet])
     vdot = script["desired_acceleration"](0.0, q, v, J)
     tau = np.concatenate([np.zeros(6), script["control"](0.0, q, v)])

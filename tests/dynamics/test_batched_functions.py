@@ -13,7 +13,7 @@ from linkages import spatial_four_bar
 from ce_gym import Model
 from ce_gym.dynamics import batched_function
 from ce_gym.dynamics.functions import FUNCTIONS
-from ce_gym.dynamics.quantities.frames import FRAME_FUNCTIONS
+from ce_gym.dynamics.quantities.frames import CONTACT_FUNCTIONS, FRAME_FUNCTIONS
 from ce_gym.model import Body, Inertial, Joint, Placement, Robot
 
 MODELS = {
@@ -50,7 +50,7 @@ def interpreted(model: Model, function: ca.Function, inputs: dict[str, np.ndarra
 def test_kernels_agree_with_the_interpreter(kind):
     model = MODELS[kind]()
     inputs = states(model, (3,))
-    for name in (*FUNCTIONS, *(f"{kind}:{model.body_names[-1]}" for kind in FRAME_FUNCTIONS)):
+    for name in (*FUNCTIONS, *CONTACT_FUNCTIONS, *(f"{kind}:{model.body_names[-1]}" for kind in FRAME_FUNCTIONS)):
         function = model.casadi_function(name)
         names = [x for x in function.name_in() if x != "guess"]
         results = model.evaluate(name, *[inputs[x] for x in names])

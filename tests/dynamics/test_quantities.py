@@ -117,6 +117,14 @@ def test_bodies_and_contacts_are_frames(case: Case):
     bias = model.contact_bias_acceleration(q, v)
     assert_close(bias, case.rate(lambda x: model.contact_points(x, v)[1]), 1e-7)
     assert_close(np.einsum("bnij,bj->bni", J, case.vdot) + bias, model.contact_accelerations(q, v, case.vdot))
+    names = model.contact_names[:3][::-1]
+    chosen = [model.contact_names.index(name) for name in names]
+    for found, expected in zip(model.contact_points(q, v, names), (points, speeds), strict=True):
+        assert_close(found, expected[:, chosen], 1e-15)
+    assert_close(model.contact_jacobian(q, names), J[:, chosen], 1e-15)
+    assert_close(model.contact_bias_acceleration(q, v, names), bias[:, chosen], 1e-12)
+    chosen_accelerations = model.contact_accelerations(q, v, case.vdot, names)
+    assert_close(chosen_accelerations, model.contact_accelerations(q, v, case.vdot)[:, chosen], 1e-12)
 
 
 def test_center_of_mass(case: Case):
@@ -255,6 +263,17 @@ def test_redundant_contacts():
     assert np.linalg.matrix_rank(J) == 6
     needed = model.mass_matrix(q) @ vdot + model.bias_force(q, v) - tau
     assert_close(forces.ravel(), np.linalg.lstsq(J.T, needed, rcond=1e-9)[0], 1e-8)
+
+
+def test_names_of_contacts():
+    model = Model("mini_cheetah")
+    q, v = model.standing_q, np.zeros(18)
+    assert model.contact_jacobian(q, []).shape == (0, 3, 18)
+    assert model.contact_points(q, v, [])[1].shape == (0, 3)
+    with pytest.raises(ValueError, match=r"contacts.*'FL'.*expected a contact of mini_cheetah.*FL_foot"):
+        model.contact_jacobian(q, ["FL"])
+    with pytest.raises(KeyError, match=r"no contact 'FL' for 'contact_jacobian'; expected one of.*FL_foot"):
+        model.casadi_function("contact_jacobian:FR_foot,FL")
 
 
 @pytest.mark.parametrize("robot", ["mini_cheetah", "four_bar"])

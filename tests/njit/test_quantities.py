@@ -31,6 +31,7 @@ METHODS = {
     "contact_accelerations": lambda model, q, v, x: model.contact_accelerations(q, v, x),
     "energy": lambda model, q, v, x: model.energy(q, v),
     "contact_jacobian": lambda model, q, v, x: model.contact_jacobian(q),
+    "contact_bias_acceleration": lambda model, q, v, x: model.contact_bias_acceleration(q, v),
     "center_of_mass": lambda model, q, v, x: model.center_of_mass(q),
     "loops": lambda model, q, v, x: (model.dependent_guess(q), model.loop_gap(q), model.nearness(q)),
 }
@@ -38,6 +39,11 @@ FRAMES = {
     "frame_pose": lambda model, q, v, x: model.frame_pose(q, model.body_names[-1]),
     "frame_velocity": lambda model, q, v, x: model.frame_velocity(q, v, model.body_names[-1]),
     "frame_jacobian": lambda model, q, v, x: model.frame_jacobian(q, model.body_names[-1]),
+}
+CONTACTS = {
+    "contact_points": lambda model, q, v, x: model.contact_points(q, v, model.contact_names[-1:]),
+    "contact_jacobian": lambda model, q, v, x: model.contact_jacobian(q, model.contact_names[-1:]),
+    "contact_bias_acceleration": lambda model, q, v, x: model.contact_bias_acceleration(q, v, model.contact_names[-1:]),
 }
 
 
@@ -55,15 +61,24 @@ def state(model: Model, batch: tuple[int, ...] = ()) -> list[np.ndarray]:
     return [q, *(rng.normal(size=(*batch, model.nv)) for _ in range(2))]
 
 
-@pytest.mark.parametrize("name", [*METHODS, *FRAMES])
+@pytest.mark.parametrize(
+    ("name", "place"),
+    [
+        *((name, None) for name in METHODS),
+        *((name, "body") for name in FRAMES),
+        *((name, "contact") for name in CONTACTS),
+    ],
+)
 @pytest.mark.parametrize("robot", ["tello", "balls"])
-def test_bits_and_shapes_are_those_of_model(name, robot):
+def test_bits_and_shapes_are_those_of_model(name, place, robot):
     model = Model(with_balls(floating=False) if robot == "balls" else robot)
-    function = quantity(model, f"{name}:{model.body_names[-1]}" if name in FRAMES else name)
+    last = {None: "", "body": f":{model.body_names[-1]}", "contact": f":{','.join(model.contact_names[-1:])}"}
+    function = quantity(model, name + last[place])
+    method = {None: METHODS, "body": FRAMES, "contact": CONTACTS}[place][name]
     for batch in ((), (2, 5)):
         arguments = state(model, batch)
         found = function(*arguments[: len(signature(function.py_func).parameters)])
-        expected = (METHODS | FRAMES)[name](model, *arguments)
+        expected = method(model, *arguments)
         found, expected = (x if isinstance(x, tuple) else (x,) for x in (found, expected))
         for a, b in zip(found, expected, strict=True):
             assert np.shape(a) == np.shape(b)

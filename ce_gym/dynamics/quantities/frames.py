@@ -5,7 +5,7 @@ All are in the axes of the world at the origin of the frame, angular part first:
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -15,8 +15,10 @@ from ce_gym.dynamics.algebra.integration import tangent_basis
 from ce_gym.dynamics.algebra.spatial import SX, axis_rotation, cross
 from ce_gym.dynamics.constraints.cluster_constraints import ClusterCoordinates
 from ce_gym.dynamics.quantities.inputs import function_of_state, state_symbols
+from ce_gym.dynamics.recursion.ce_aba import gravity_acceleration
+from ce_gym.dynamics.recursion.ce_rnea import outward_acceleration
 from ce_gym.dynamics.recursion.kinematics import Kinematics, constant, outward_velocity_pass
-from ce_gym.model.description import Frame
+from ce_gym.model.description import ContactSphere, Frame
 from ce_gym.model.frames import Placement
 from ce_gym.model.mechanism import Mechanism
 
@@ -103,10 +105,48 @@ def _frame_bias_acceleration(mechanism: Mechanism, frame: str) -> ca.Function:
     return function_of_state("frame_bias_acceleration", guess, {"q": q, "v": v}, {"acceleration": acceleration})
 
 
-def _contact_jacobian(mechanism: Mechanism) -> ca.Function:
+def _contact_points(mechanism: Mechanism, contacts: Sequence[ContactSphere]) -> ca.Function:
     q, v, guess = state_symbols(mechanism)
     kinematics = outward_velocity_pass(mechanism, q, v, guess)
-    points = [(contact.body, Placement(contact.position)) for contact in mechanism.robot.contacts]
+    positions, velocities = [SX(3, 0)], [SX(3, 0)]
+    for contact in contacts:
+        body, r = kinematics.bodies[contact.body], constant(np.array(contact.position))
+        positions.append(body.point_position(r))
+        velocities.append(body.R @ body.point_velocity(r))
+    outputs = {"positions": ca.horzcat(*positions), "velocities": ca.horzcat(*velocities)}
+    return function_of_state("contact_points", guess, {"q": q, "v": v}, outputs)
+
+
+def _contact_accelerations(mechanism: Mechanism, contacts: Sequence[ContactSphere]) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    vdot = SX.sym("vdot", v.shape[0])
+    accelerations = _accelerations_of(contacts, mechanism, outward_velocity_pass(mechanism, q, v, guess), vdot)
+    inputs = {"q": q, "v": v, "vdot": vdot}
+    return function_of_state("contact_accelerations", guess, inputs, {"accelerations": accelerations})
+
+
+def _contact_bias_acceleration(mechanism: Mechanism, contacts: Sequence[ContactSphere]) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
+    accelerations = _accelerations_of(contacts, mechanism, kinematics, SX(*v.shape))
+    return function_of_state("contact_bias_acceleration", guess, {"q": q, "v": v}, {"accelerations": accelerations})
+
+
+def _accelerations_of(contacts: Sequence[ContactSphere], mechanism: Mechanism, kinematics: Kinematics, vdot: SX) -> SX:
+    """Return the accelerations of contacts, world axes, without gravity [m/s^2], shape (3, n)."""
+    a_bodies, _ = outward_acceleration(mechanism, kinematics, vdot)
+    gravity, accelerations = gravity_acceleration(mechanism), [SX(3, 0)]
+    for contact in contacts:
+        body, a, r = kinematics.bodies[contact.body], a_bodies[contact.body], constant(np.array(contact.position))
+        in_body_axes = a[3:] + cross(a[:3], r) + cross(body.v[:3], cross(body.v[:3], r))
+        accelerations.append(body.R @ in_body_axes + gravity)
+    return ca.horzcat(*accelerations)
+
+
+def _contact_jacobian(mechanism: Mechanism, contacts: Sequence[ContactSphere]) -> ca.Function:
+    q, v, guess = state_symbols(mechanism)
+    kinematics = outward_velocity_pass(mechanism, q, v, guess)
+    points = [(contact.body, Placement(contact.position)) for contact in contacts]
     velocities = [body_motion(mechanism, kinematics, body).placed(place).v for body, place in points]
     J = ca.jacobian(ca.vertcat(SX(0, 1), *velocities), v)
     return function_of_state("contact_jacobian", guess, {"q": q}, {"J": J})
@@ -120,4 +160,10 @@ FRAME_FUNCTIONS: dict[str, Callable[[Mechanism, str], ca.Function]] = {
 }
 """Quantities of one frame: functions of a mechanism and the name of the frame."""
 
-CONTACT_FUNCTIONS: dict[str, Callable[[Mechanism], ca.Function]] = {"contact_jacobian": _contact_jacobian}
+CONTACT_FUNCTIONS: dict[str, Callable[[Mechanism, Sequence[ContactSphere]], ca.Function]] = {
+    "contact_points": _contact_points,
+    "contact_accelerations": _contact_accelerations,
+    "contact_bias_acceleration": _contact_bias_acceleration,
+    "contact_jacobian": _contact_jacobian,
+}
+"""Quantities of contacts: functions of a mechanism and the contacts."""
