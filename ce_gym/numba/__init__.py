@@ -8,6 +8,7 @@ try:
 except ImportError:
     raise ImportError('ce_gym.numba needs numba, which is not installed: pip install "ce_gym[numba]"') from None
 
+from ce_gym.numba.constrained import constrained_forward_dynamics, operational_space_inertia
 from ce_gym.numba.controller import Controller, controller
 from ce_gym.numba.quantities import (
     bias_force,
@@ -25,11 +26,13 @@ __all__ = [
     "Robots",
     "bias_force",
     "body_poses",
+    "constrained_forward_dynamics",
     "contact_points",
     "controller",
     "forward_dynamics",
     "inverse_dynamics",
     "mass_matrix",
+    "operational_space_inertia",
     "quantity",
     "stepper",
 ]
