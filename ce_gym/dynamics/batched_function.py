@@ -1,7 +1,7 @@
 """Traced functions of a robot's state as kernels, on arrays with any leading batch shape.
 
 A kernel scales quaternions to unit length, follows dependent coordinates that no formula gives, and evaluates the
-function. Its last output tells whether results are numbers.
+function. Its last output tells whether results and positions are finite.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LONG = 25_000
 INTERPRETED = 5000
 """Robots for which a long function is interpreted before it is compiled; that takes about as long as compiling it."""
 CHECK = "check"
-"""Output that is 0 if the state is accepted and all other outputs are finite, else 1."""
+"""Output that is 0 if `q` is accepted and finite and all other outputs are finite, else 1."""
 CLOSED = {"float64": 1e-9, "float32": 1e-5}
 """Largest gap of closed loops [m, -], by dtype."""
 
@@ -43,12 +43,14 @@ class BatchedFunction:
         continuation: Finds the dependent coordinates that no formula gives; None if the robot has none.
         dtype: "float64" or "float32" for arithmetic and results.
         num_threads: Threads that share the robots of a call.
+        nan_rows: Whether all outputs of a robot are nan if an output or an entry of `q` is not finite.
 
     Attributes:
         function: The function.
         inputs: Sizes of the inputs by name, without "guess".
         outputs: Rows and columns of the outputs by name.
         is_long: Whether the function is interpreted at first.
+        nan_rows: Whether all outputs of a robot are nan if an output or an entry of `q` is not finite.
     """
 
     def __init__(
@@ -59,8 +61,9 @@ class BatchedFunction:
         continuation: Continuation | None,
         dtype: str,
         num_threads: int,
+        nan_rows: bool,
     ) -> None:
-        self.function = function
+        self.function, self.nan_rows = function, nan_rows
         self.inputs = {x: function.numel_in(x) for x in function.name_in() if x != GUESS}
         self.outputs = {x: function.size_out(x) for x in function.name_out()}
         self.is_long = function.n_instructions() > LONG
@@ -103,6 +106,9 @@ class BatchedFunction:
         call.run()
         results, is_number = [output.copy() for output in call.outputs], call.check[0, 0] == 0.0
         self._free_calls.append(call)
+        if self.nan_rows and not is_number:
+            for result in results:
+                result[...] = np.nan
         return results, bool(is_number)
 
     def _single_call(self) -> _SingleCall:
@@ -136,8 +142,12 @@ class BatchedFunction:
             self._interpret(rows, results)
         else:
             self.kernel(rows | results, n, num_threads=self._num_threads)
+        wrong = results[CHECK][:, 0] != 0.0
+        if self.nan_rows and wrong.any():
+            for name in self.outputs:
+                results[name][wrong] = np.nan
         outputs = [results[name].reshape(*batch, *shape) for name, shape in self.outputs.items()]
-        return outputs, not results[CHECK].any()
+        return outputs, not wrong.any()
 
     def _interpret(self, rows: dict[str, Array], results: dict[str, Array]) -> None:
         """Execute the calls by CasADi's interpreter."""
@@ -188,9 +198,8 @@ class BatchedFunction:
             arguments[GUESS] = ca.if_else(gap < CLOSED[self._dtype.name], guess, np.nan)
         outputs = self.function.call([arguments[name] for name in self.function.name_in()])
         columns = {name: ca.vec(output.T) for name, output in zip(self.outputs, outputs, strict=True)}
-        quaternions = [symbols["q"][i] for i in self._quaternions] if "q" in symbols else []
-        total = sum([*quaternions, *[ca.sum1(column) for column in columns.values()]], SX(0))
-        columns[CHECK] = ca.if_else(ca.fabs(total) <= np.inf, 0.0, 1.0)
+        total = sum([ca.sum1(column) for column in (*columns.values(), symbols.get("q", SX(0)))], SX(0))
+        columns[CHECK] = ca.if_else(ca.fabs(total) < np.inf, 0.0, 1.0)
         used = {name: symbol for name, symbol in inputs.items() if symbol.numel()}
         full = {name: column for name, column in columns.items() if column.numel()}
         return ca.Function(self.function.name(), [*used.values()], [*full.values()], [*used], [*full])

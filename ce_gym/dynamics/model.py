@@ -214,7 +214,8 @@ class Model:
             arguments: Its inputs but for the guess of dependent coordinates, shape (..., n) each.
 
         Returns:
-            Its outputs, shape (..., rows, columns).
+            Its outputs, shape (..., rows, columns). Of a quantity but "loops", all entries of a robot are nan if an
+            entry of `q` or of the results is not finite.
 
         Raises:
             ValueError: If a shape is wrong, or a loop does not close at `q`.
@@ -231,19 +232,21 @@ class Model:
             traced: ca.Function = self.casadi_function(function) if isinstance(function, str) else function
             name = f"{self.robot.name} {self.transmission} {traced.name()}"
             turns = [i for i, _ in self.robot.layout.turns]
+            nan_rows = isinstance(function, str) and function != "loops"  # which tells what does not close
             self._batched[function] = BatchedFunction(
-                name, traced, turns, self._continuation, self.dtype, self.num_threads
+                name, traced, turns, self._continuation, self.dtype, self.num_threads, nan_rows
             )
         return self._batched[function]
 
     def _check_results(self, batched: BatchedFunction, arguments: Sequence[ArrayLike], results: list[NDArray]) -> None:
-        """Raise the error of a state that has no results, if the arguments are numbers."""
+        """Raise the error of a finite state that has no results."""
         arrays = {x: np.asarray(a, dtype=float) for x, a in zip(batched.inputs, arguments, strict=True)}
+        are_finite = {x: np.isfinite(array).all(-1) for x, array in arrays.items()}
         if "q" in arrays:
-            self.dependent_guess(arrays["q"])
-        name = batched.function.name()
-        has_nan = any(np.isnan(r).any() for r in results) and not any(np.isnan(a).any() for a in arrays.values())
-        if self._has_loops and name != "loops" and has_nan:
+            self.dependent_guess(arrays["q"][are_finite["q"]])
+        name, has_nan = batched.function.name(), np.any([np.isnan(r).any((-2, -1)) for r in results], axis=0)
+        is_wrong = has_nan & np.all(np.broadcast_arrays(*are_finite.values()), axis=0)
+        if self._has_loops and name != "loops" and is_wrong.any():
             raise ValueError(f"{name}: the loops of {self.robot.name} cannot be closed at this q")
 
     def forward_dynamics(

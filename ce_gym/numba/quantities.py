@@ -24,9 +24,9 @@ def quantity(model: Model, name: str) -> Callable[..., Any]:
     """Return a quantity of a robot as an `@njit` function.
 
     The function takes C-contiguous or other arrays of one robot, shape (n,), or of many, shape (..., n), with the same
-    number of rows each. It returns the same arrays as the method of `Model` with the same name. Where the method raises
-    a ValueError because of a quaternion or a loop, entries that depend on it are not numbers. Several threads may call
-    the function.
+    number of rows each. It returns the same arrays as the method of `Model` with the same name. All results of a robot
+    are nan if `q` or a result is not finite, or if the method raises a ValueError because of a quaternion or a loop.
+    Several threads may call the function.
 
     Args:
         model: The robot at a transmission level. Results have its `dtype`; `num_threads` is ignored.
@@ -41,6 +41,7 @@ def quantity(model: Model, name: str) -> Callable[..., Any]:
     shapes = ", ".join(f"{x} (..., {size})" for x, size in sizes.items())
     wrong = [f"{x}.shape[-1] != {size} or {x}.size != n * {size}" for x, size in sizes.items()]
     used = ", ".join(buffer.name for buffer in kernel.arguments)
+    fill = ["for i in range(n):", "    if check[i] != 0.0:", *[f"        {x}[i] = np.nan" for x in batched.outputs]]
     lines = [
         f"def {label}({', '.join(sizes)}):",
         f"n = {first}.size // {sizes[first]}",
@@ -50,6 +51,7 @@ def quantity(model: Model, name: str) -> Callable[..., Any]:
         *[f"{x} = np.empty((n, {rows}, {columns}), dtype)" for x, (rows, columns) in batched.outputs.items()],
         "check = np.empty(n, dtype)",
         f"call(({used},), np.empty({scratch_size(kernel)}, np.int64), 0, 0, -(-n // {kernel.lanes}), n)",
+        *(fill if batched.nan_rows else []),
         f"shape = {first}.shape[:-1]",
         f"return {', '.join(_result(label, x, *size) for x, size in batched.outputs.items())}",
     ]

@@ -123,16 +123,24 @@ def test_long_functions_are_interpreted_at_first(monkeypatch):
         np.testing.assert_allclose(results[0], results[2], rtol=0, atol=1e-12)
 
 
-def test_numbers_that_are_not():
-    """They stay in their row, and are no error."""
-    model = MODELS["loops"]()
-    inputs = states(model, (3,))
-    expected = model.bias_force(inputs["q"], inputs["v"])
-    inputs["v"][1, 2] = np.nan
-    found = model.bias_force(inputs["q"], inputs["v"])
-    assert np.isnan(found[1]).any()
-    assert np.array_equal(found[[0, 2]], expected[[0, 2]])
-    assert np.isnan(model.bias_force(inputs["q"][1], inputs["v"][1])).any()
+@pytest.mark.parametrize("kind", ["floating", "loops", "balls", "no formula"])
+@pytest.mark.parametrize("compiled", [True, False])
+def test_rows_of_numbers_that_are_not_finite(kind, compiled, monkeypatch):
+    """All results of a robot are nan, those that do not depend on the wrong number, too; others keep their bits."""
+    monkeypatch.setattr(batched_function, "LONG", batched_function.LONG if compiled else 0)
+    model = MODELS[kind]()
+    base = model.body_names[0]
+    for name in ("mass_matrix", "bias_force", "energy", f"frame_jacobian:{base}", f"frame_pose:{base}"):
+        inputs = states(model, (3,))
+        names = [x for x in model.casadi_function(name).name_in() if x != "guess"]
+        expected = model.evaluate(name, *[inputs[x] for x in names])
+        inputs["q"][1, -1] = np.nan if model.robot.floating else np.inf
+        found = model.evaluate(name, *[inputs[x] for x in names])
+        for result, right in zip(found, expected, strict=True):
+            assert np.isnan(result[1]).all(), name
+            assert np.array_equal(result[[0, 2]], right[[0, 2]])
+        single = model.evaluate(name, *[inputs[x][1] for x in names])
+        assert all(np.isnan(result).all() for result in single)
 
 
 def test_robots_without_joints_and_contacts():

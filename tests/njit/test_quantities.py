@@ -5,14 +5,17 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from inspect import signature
 from pathlib import Path
 
 import numpy as np
 import pytest
 from ball_joints import with_balls
+from linkages import four_bar, spatial_four_bar
 
 from ce_gym import Model, load_robot
+from ce_gym.model import Pose
 
 numba = pytest.importorskip("numba")
 
@@ -45,6 +48,18 @@ CONTACTS = {
     "contact_jacobian": lambda model, q, v, x: model.contact_jacobian(q, model.contact_names[-1:]),
     "contact_bias_acceleration": lambda model, q, v, x: model.contact_bias_acceleration(q, v, model.contact_names[-1:]),
 }
+DRIVEN_ROCKERS = {
+    "open loop": four_bar(
+        independent=("rocker",), pose=Pose(joints=(("rocker", 1.5),)), assembly=(("crank", 0.7), ("coupler", 0.0))
+    ),
+    "no formula": replace(
+        spatial_four_bar(),
+        independent=("rocker",),
+        pose=Pose(joints=(("rocker", 1.65),)),
+        assembly=(("crank", 0.6), ("pitch", -0.2), ("coupler", 0.1)),
+    ),
+}
+"""Four-bar linkages that do not close 2 rad beyond the standing pose."""
 
 
 @pytest.fixture(scope="module")
@@ -107,13 +122,28 @@ def test_wrong_shapes_are_refused(model):
             function(*arguments)
 
 
-def test_rows_without_a_result_are_not_numbers(model):
-    q, v, tau = state(model, (4,))
-    expected = model.forward_dynamics(q, v, tau)
-    q[1, 3:7] *= 1.1
-    found = forward_dynamics(model)(q, v, tau)
-    assert np.isnan(found[1]).any()
-    assert np.array_equal(found[[0, 2, 3]], expected[[0, 2, 3]])
+@pytest.mark.parametrize("case", ["quaternion", "not finite", "open loop", "no formula"])
+@pytest.mark.parametrize("name", ["mass_matrix", "implicit_constraint", "frame_pose"])
+def test_rows_without_a_result_are_not_numbers(name, case):
+    """All results of a robot are nan, those that do not depend on the wrong number, too; others keep their bits."""
+    model = Model(DRIVEN_ROCKERS.get(case, "mini_cheetah"))
+    full = f"{name}:{model.body_names[0]}" if name == "frame_pose" else name
+    function, q = quantity(model, full), np.tile(model.standing_q, (4, 1))
+    v = [np.ones((4, model.nv))] if name == "implicit_constraint" else []
+    expected = model.evaluate(full, q, *v)
+    if case == "quaternion":
+        q[1, 3:7] *= 1.1
+    else:
+        q[1, -1] = np.inf if case == "not finite" else model.standing_q[-1] + 2.0
+    found = function(q, *v)
+    for result, right in zip(found if isinstance(found, tuple) else (found,), expected, strict=True):
+        assert np.isnan(result[1]).all()
+        assert np.array_equal(result[[0, 2, 3]].ravel(), right[[0, 2, 3]].ravel())
+    if case in DRIVEN_ROCKERS:
+        with pytest.raises(ValueError, match="close"):
+            model.evaluate(full, [q[1], np.full(model.nq, np.nan)], *[x[:2] for x in v])
+    single = function(q[1], *[x[1] for x in v])
+    assert all(np.isnan(result).all() for result in (single if isinstance(single, tuple) else (single,)))
 
 
 def test_a_control_law_in_njit(model):

@@ -14,7 +14,7 @@ from ce_gym.model import Robot, load_robot, robots
 from ce_gym.model.mechanism import LEVELS
 from ce_gym.sim.simulator import Simulator
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "dynamics"))  # for dense.py and linkages.py
+sys.path.insert(0, str(Path(__file__).parents[1] / "dynamics"))  # for dense.py
 from dense import Dense
 from linkages import four_bar, rod_leg, spatial_four_bar
 
