@@ -19,10 +19,11 @@ from ce_gym.numba.quantities import (
     mass_matrix,
     quantity,
 )
-from ce_gym.numba.stepper import Robots, stepper
+from ce_gym.numba.stepper import Memory, Robots, set_state, stepper
 
 __all__ = [
     "Controller",
+    "Memory",
     "Robots",
     "bias_force",
     "body_poses",
@@ -34,5 +35,6 @@ __all__ = [
     "mass_matrix",
     "operational_space_inertia",
     "quantity",
+    "set_state",
     "stepper",
 ]

@@ -17,6 +17,7 @@ model = ce_gym.Model("mini_cheetah")
 real = ce_gym.Simulator(model)
 imagined = ce_gym.Simulator(model, N_SAMPLES, outputs=())
 robots, step = ce_gym.numba.stepper(imagined)
+set_state = ce_gym.numba.set_state(imagined)
 
 
 @numba.njit
@@ -27,13 +28,15 @@ def cost(q, v):
 
 
 @numba.njit
-def improve(plan, robots):
-    """Return a plan (HORIZON, 12) weighted by the costs of its variations, from the state of the robots on."""
+def improve(plan, robots, q, v):
+    """Return a plan (HORIZON, 12) weighted by the costs of its variations, from a state on."""
     lanes = robots.q.shape[2]
     noise = np.random.normal(0.0, SPREAD, (N_SAMPLES, HORIZON, 12))
     for row in range(1, HORIZON):
         noise[:, row] = noise[:, row - 1] + 0.3 * noise[:, row]  # smooth variations
     noise[0] = 0
+    for k in range(N_SAMPLES):
+        set_state(robots, k, q, v)
     costs = np.zeros(N_SAMPLES)
     for row in range(HORIZON):
         robots.target[:] = plan[row] + noise[:, row]
@@ -64,8 +67,7 @@ def main(n_steps=60):
     plan = np.tile(q[7:], (HORIZON, 1))
     heights = []
     for _ in range(n_steps):
-        imagined.set_state(real.q[0], real.v[0])
-        plan = improve(plan, robots)
+        plan = improve(plan, robots, real.q[0], real.v[0])
         real.step(plan[0], N_SUBSTEPS)
         plan = np.vstack([plan[1:], plan[-1:]])
         heights.append(real.q[0, 2])
