@@ -22,7 +22,7 @@ from ce_gym.model.errors import listed_names
 
 BENCHMARKS = (
     "speed", "beside", "instructions", "throughput", "tracking", "stability", "accuracy", "derivatives",
-    "growth", "gpu", "digests", "all",
+    "dynamics", "growth", "gpu", "digests", "all",
 )  # fmt: skip
 
 
