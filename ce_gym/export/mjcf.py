@@ -54,7 +54,8 @@ def to_mjcf(
     Loops are closed by connects and rods by spatial tendons at every level. All of MuJoCo's equalities are soft, and as
     stiff as the lightest body that they hold. Use `coupled` for robots with a massless link between rotors and a loop.
 
-    Joints, their position actuators and their tendons have the names of the moved bodies. The keyframe "stand" is the
+    Joints and their position actuators have the names of the joints, see `Robot.joint_name`. Tendons have the names of
+    the moved bodies. Frames of the robot are sites, but for frames of omitted rotors. The keyframe "stand" is the
     standing pose, and joints of clusters with loops have it as `ref`. Contact spheres collide with the ground only.
 
     MJCF has no counterpart of these data:
@@ -99,6 +100,7 @@ def to_mjcf(
     for moving in (*mechanism.bodies.values(), *(moving for moving, _ in massless.values())):
         elements[moving.name] = _add_body(elements[moving.parent], moving, robot, reference, armature)
     add_ties(root, elements, mechanism, ties, reference, solver)
+    _add_frames(root, elements, robot)
     _add_actuators(root, robot)
     _add_standing_pose(root, robot, standing)
     ET.indent(root)
@@ -127,9 +129,9 @@ def _add_body(
     pose = {"pos": text(position), "quat": text(quaternion(rotation))}
     element = ET.SubElement(parent, "body", {"name": body.name, **pose})
     if moving.joint.type == "free":
-        ET.SubElement(element, "freejoint", name=body.name)
+        ET.SubElement(element, "freejoint", name=robot.joint_name(body.name))
     else:
-        joint = ET.SubElement(element, "joint", name=body.name, type=MJCF_JOINTS[body.joint.type])
+        joint = ET.SubElement(element, "joint", name=robot.joint_name(body.name), type=MJCF_JOINTS[body.joint.type])
         lower, upper = body.joint.position
         if body.joint.type == "ball":
             lower = 0.0 if math.isfinite(upper) else lower
@@ -208,12 +210,25 @@ def _add_shape(element: ET.Element, shape: Shape) -> None:
     ET.SubElement(element, "geom", {"type": shape.type, "size": text(sizes[shape.type]), **place, **visual})
 
 
+def _add_frames(root: ET.Element, elements: Mapping[str | None, ET.Element], robot: Robot) -> None:
+    """Add the frames of the robot as sites, unless a loop or rod has a site of that name."""
+    sites = {site.get("name") for site in root.iter("site")}
+    for frame in robot.frames:
+        if frame.name not in sites and frame.body in elements:
+            place = {
+                "pos": text(frame.placement.position),
+                "quat": text(quaternion(np.array(frame.placement.rotation))),
+            }
+            ET.SubElement(elements[frame.body], "site", {"name": frame.name, **place, "size": "0.005", "group": "3"})
+
+
 def _add_actuators(root: ET.Element, robot: Robot) -> None:
     kp, kd = dict(robot.gains.kp), dict(robot.gains.kd)
     actuators = ET.SubElement(root, "actuator")
     for name in robot.driven:
         gains = {"kp": text(kp.get(name, 0.0)), "kv": text(kd.get(name, 0.0))}
-        actuator = ET.SubElement(actuators, "position", {"name": name, "joint": name, **gains})
+        joint = robot.joint_name(name)
+        actuator = ET.SubElement(actuators, "position", {"name": joint, "joint": joint, **gains})
         torque = robot.body(name).joint.torque
         if math.isfinite(torque):
             actuator.set("forcerange", text((-torque, torque)))

@@ -155,32 +155,41 @@ def add_ties(
         solver: Attributes `solref` and `solimp` of equalities.
     """
     tendons, equalities = ET.Element("tendon"), ET.Element("equality")
-    massless = massless_rotors(mechanism, ties)
+    massless, joint_name = massless_rotors(mechanism, ties), mechanism.robot.joint_name
     for name in (*mechanism.bodies, *massless):
         if name in ties and name not in ties[name].ratios:
             tie = ties[name].scaled(1.0 / largest_ratio(ties[name])) if name in massless else ties[name]
             constant = tie.at({joint: reference.get(joint, 0.0) for joint in tie.ratios}) - reference.get(name, 0.0)
-            _add_linear(tendons, equalities, name, tie, constant, solver)
+            ratios = {joint_name(joint): ratio for joint, ratio in tie.ratios.items()}
+            _add_linear(tendons, equalities, name, joint_name(name), ratios, constant, solver)
     for constraint in mechanism.robot.constraints:
         if not constraint.linear:
             EXPORTS[type(constraint)](elements, tendons, equalities, constraint, solver)
     if _reflects_all(mechanism):
         for rotor in _eliminated_rotors(mechanism):
             if len(ties[rotor.name].ratios) > 1 and rotor.name not in massless:
-                tendon = _fixed_tendon(tendons, rotor.name, ties[rotor.name].ratios)
+                ratios = {joint_name(joint): ratio for joint, ratio in ties[rotor.name].ratios.items()}
+                tendon = _fixed_tendon(tendons, rotor.name, ratios)
                 tendon.set("armature", text(rotor.inertia))
     root.extend(element for element in (tendons, equalities) if len(element))
 
 
 def _add_linear(
-    tendons: ET.Element, equalities: ET.Element, name: str, tie: Tie, constant: float, solver: Attributes
+    tendons: ET.Element,
+    equalities: ET.Element,
+    name: str,
+    joint: str,
+    ratios: Mapping[str, float],
+    constant: float,
+    solver: Attributes,
 ) -> None:
-    if len(tie.ratios) == 1:
-        ((other, ratio),) = tie.ratios.items()
-        pair = {"joint1": name, "joint2": other, "polycoef": text((constant, ratio, 0, 0, 0))}
+    """Tie a joint to others, whose ratios are given by name; a tendon gets the name of the moved body."""
+    if len(ratios) == 1:
+        ((other, ratio),) = ratios.items()
+        pair = {"joint1": joint, "joint2": other, "polycoef": text((constant, ratio, 0, 0, 0))}
         ET.SubElement(equalities, "joint", {**pair, **solver})
         return
-    _fixed_tendon(tendons, name, {name: 1.0, **{joint: -ratio for joint, ratio in tie.ratios.items()}})
+    _fixed_tendon(tendons, name, {joint: 1.0, **{other: -ratio for other, ratio in ratios.items()}})
     ET.SubElement(equalities, "tendon", {"tendon1": name, "polycoef": text((constant, 0, 0, 0, 0)), **solver})
 
 

@@ -28,13 +28,15 @@ Array = NDArray[np.float64]
 
 def rotor_scale(model: mujoco.MjModel, robot: Robot, name: str, tie: Tie) -> float:
     """Return a rotor's angle over its coordinate in MJCF: the largest ratio for `massless_rotors`, else 1."""
-    joints = [j for j in range(model.njnt) if model.joint(j).name == name and robot.body(name).kind == "rotor"]
-    return largest_ratio(tie) if any(model.dof_armature[model.jnt_dofadr[j]] for j in joints) else 1.0
+    rows = joint_rows(model)
+    is_rotor = name in rows and robot.body(name).kind == "rotor"
+    return largest_ratio(tie) if is_rotor and model.dof_armature[rows[name][1]] else 1.0
 
 
 def joint_rows(model: mujoco.MjModel) -> dict[str, tuple[int, int]]:
-    """Return the first rows of each joint in `qpos` and in `qvel`, by name."""
-    return {model.joint(i).name: (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])) for i in range(model.njnt)}
+    """Return the first rows of each joint in `qpos` and in `qvel`, by name of the body that the joint moves."""
+    bodies = [model.body(body).name for body in model.jnt_bodyid]
+    return {name: (int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])) for i, name in enumerate(bodies)}
 
 
 @dataclass(frozen=True)

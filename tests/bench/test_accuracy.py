@@ -22,6 +22,7 @@ from ce_gym.bench.accuracy.references import contact as accuracy_contact
 from ce_gym.bench.accuracy.references import restated as accuracy_restated
 from ce_gym.bench.accuracy.references import smooth as accuracy_references
 from ce_gym.bench.accuracy.scenarios import HOLD, SCENES, Scene, Way
+from ce_gym.export.mujoco_coordinates import joint_rows
 from ce_gym.model.checks.collisions import colliding
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
@@ -147,7 +148,7 @@ def test_mujoco_lets_only_the_pairs_touch():
     data, q = mujoco.MjData(family.model), scene.q.copy()
     for i, name in enumerate(model.joint_links):
         q[7 + i] += {"R": 0.55, "L": -0.55}[name[1]] if name.endswith("_abad_link") else 0.0
-        data.qpos[family.model.joint(name).qposadr[0]] = q[7 + i]
+        data.qpos[joint_rows(family.model)[name][0]] = q[7 + i]
     data.qpos[:7] = q[:7]
     mujoco.mj_forward(family.model, data)
     places, turns = model.body_poses(q)

@@ -32,7 +32,7 @@ MAY_IMPORT = {
     "learn": {"model", "dynamics", "compile", "export", "envs", "adapters", "policies", "viewer"},
     "bench": {
         "model", "dynamics", "compile", "export", "sim", "envs", "diagnostics", "adapters", "policies", "viewer",
-        "identify",
+        "identify", "numba",
     },
 }  # fmt: skip
 """The folders of the package, and the other folders that the modules of each may import."""

@@ -6,10 +6,11 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
+from ce_gym.convert import JointOrder
 from ce_gym.dynamics.model import Model
 from ce_gym.export.joint_ties import joint_ties
 from ce_gym.export.mjcf import mass_properties, quaternion, to_mjcf, valid_inertia
-from ce_gym.model import Constraint, LinearConstraint, RobotError, load_robot
+from ce_gym.model import Constraint, Frame, LinearConstraint, Placement, RobotError, load_robot
 from ce_gym.model.mechanism import LEVELS, build_mechanism
 
 ROBOTS = ("mini_cheetah", "mit_humanoid_leg")
@@ -83,7 +84,7 @@ def test_gears_are_joint_equalities_and_belts_are_tendons():
     assert gears["hip_ry_rotor"].split()[1] == "6.0"
     assert [e.get("tendon1") for e in root.findall("equality/tendon")] == ["ankle_rotor"]
     coefficients = {j.get("joint"): j.get("coef") for j in root.findall("tendon/fixed[@name='ankle_rotor']/joint")}
-    assert coefficients == {"ankle_rotor": "1.0", "knee_link": "-12.0", "ankle_link": "-12.0"}
+    assert coefficients == {"ankle_rotor": "1.0", "knee_link_joint": "-12.0", "ankle_link_joint": "-12.0"}
     assert all(e.get("solref") == "0.01 1.0" for e in root.find("equality"))
 
 
@@ -92,8 +93,8 @@ def test_armature_is_the_diagonal_of_the_reflected_inertia():
     armature = {
         joint.get("name"): float(joint.get("armature")) for joint in root.iter("joint") if joint.get("armature")
     }
-    assert armature["knee_link"] == pytest.approx(12**2 * (0.0005548 + 0.00016841), rel=1e-12)
-    assert armature["ankle_link"] == pytest.approx(12**2 * 0.00016841, rel=1e-12)
+    assert armature["knee_link_joint"] == pytest.approx(12**2 * (0.0005548 + 0.00016841), rel=1e-12)
+    assert armature["ankle_link_joint"] == pytest.approx(12**2 * 0.00016841, rel=1e-12)
     none = ET.fromstring(to_mjcf(load_robot("mit_humanoid_leg"), "none"))
     assert not any(joint.get("armature") for joint in none.iter("joint"))
 
@@ -126,6 +127,28 @@ def test_armature_survives_a_round_trip(armature, gear, level, tmp_path):
     written = mujoco_dynamics.mass_matrix(mujoco.MjModel.from_xml_path(str(path)), robot, q)
     for found in (written[6, 6], again.mass_matrix(again.standing_q)[6, 6]):
         assert found - (M[6, 6] - armature) == pytest.approx(armature, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::ce_gym.LossyImportWarning")
+@pytest.mark.parametrize("name", ["go1", "tello", "mit_humanoid_leg"])
+def test_names_of_joints_and_frames_survive_a_round_trip(name, tmp_path):
+    pytest.importorskip("mujoco")
+    robot, pose = load_robot(name), Placement((0.1, -0.2, 0.3), ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    further = (Frame("sensor", robot.independent[-1], pose), Frame("marker", None, pose))
+    robot = dataclasses.replace(robot, frames=(*robot.frames, *further))
+    (tmp_path / "robot.xml").write_text(to_mjcf(robot, ground=robot.floating))
+    again, ours = load_robot(tmp_path / "robot.xml"), Model(robot)
+    assert {again.joint_name(body): body for body in again.independent} == {
+        robot.joint_name(body): body for body in robot.independent
+    }
+    assert any(robot.joint_name(body) != body for body in robot.independent)
+    theirs, rng = Model(again), np.random.default_rng(0)
+    q = ours.standing_q + rng.uniform(-0.05, 0.05, ours.nq) * (np.arange(ours.nq) >= 7)
+    order = JointOrder(ours, theirs.joint_links)
+    (q_again,) = order.from_model(q)
+    for frame in robot.frames:
+        for found, expected in zip(theirs.frame_pose(q_again, frame.name), ours.frame_pose(q, frame.name), strict=True):
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
 def test_offsets_of_constraints_are_kept():

@@ -137,17 +137,19 @@ class Peer:
     def __init__(self, robot: Robot, level: str) -> None:
         import mujoco
 
+        from ce_gym.export.mujoco_coordinates import joint_rows
         from ce_gym.export.mujoco_model import load
 
         self.mujoco, self.model = mujoco, load(robot, level)
         self.model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         self.data, self.floating = mujoco.MjData(self.model), robot.floating
-        self.joints = [self.model.joint(i).name for i in range(self.model.njnt)][1 if robot.floating else 0 :]
+        rows = joint_rows(self.model)
+        self.joints = [*rows][1 if robot.floating else 0 :]
         spanning = [b.name for b in robot.bodies if b.joint.type != "free"]
         self.columns = [spanning.index(name) for name in self.joints]
         self.scales = np.ones(len(self.joints))
         for i, (name, tie) in enumerate((name, joint_ties(build_mechanism(robot))[name]) for name in self.joints):
-            if robot.body(name).kind == "rotor" and self.model.joint(name).armature:
+            if robot.body(name).kind == "rotor" and self.model.dof_armature[rows[name][1]]:
                 self.scales[i] = max(map(abs, tie.ratios.values()))
 
     def rotation(self, q):
@@ -263,6 +265,8 @@ def test_the_file_starts_assembled(name):
 def test_mujoco_moves_as_we_do(name, level):
     """A tenth of a second without control: MuJoCo's soft equalities hold, and the joints move where ours do."""
     mujoco = pytest.importorskip("mujoco")
+    from ce_gym.export.mujoco_coordinates import joint_rows
+
     robot = dataclasses.replace(robot_called(name), contacts=())
     model = Model(robot, level)
     dt, steps = 2e-4, 500
@@ -276,9 +280,10 @@ def test_mujoco_moves_as_we_do(name, level):
     q, v = model.standing_q.copy(), np.zeros(model.nv)
     v[base[1] :] = np.linspace(0.5, 1.0, model.nv - base[1])
     _, v_span = model.spanning(q, v)
+    rows = joint_rows(peer)
     for i, joint in enumerate(model.spanning_names):
-        if any(peer.joint(j).name == joint for j in range(peer.njnt)):
-            data.joint(joint).qvel = v_span[base[1] + i]
+        if joint in rows:
+            data.qvel[rows[joint][1]] = v_span[base[1] + i]
     start = q.copy()
     damping = np.array([robot.body(j).joint.damping for j in model.joint_links])
     for _ in range(steps):
@@ -289,7 +294,7 @@ def test_mujoco_moves_as_we_do(name, level):
         if robot.floating:  # joints do not feel where a falling base is, only how it is turned
             q[3:7] += dt / 2 * np.array([-q[4:7] @ v[:3], *(q[3] * v[:3] + np.cross(q[4:7], v[:3]))])
             q[3:7] /= np.linalg.norm(q[3:7])
-    theirs = np.array([data.joint(joint).qpos[0] for joint in model.joint_links])
+    theirs = np.array([data.qpos[rows[joint][0]] for joint in model.joint_links])
     travelled = np.abs(q - start)[base[0] :].max()
     assert travelled > 0.03
     assert np.abs(theirs - q[base[0] :]).max() < 0.02 * travelled

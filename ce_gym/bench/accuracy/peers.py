@@ -15,6 +15,7 @@ from ce_gym.bench.accuracy.statements import ratios, stated
 from ce_gym.dynamics.model import Model
 from ce_gym.export import mujoco_model
 from ce_gym.export.mujoco_batch import STATE
+from ce_gym.export.mujoco_coordinates import joint_rows
 from ce_gym.export.mujoco_model import STIFF, Settings
 from ce_gym.model.mechanism import ELASTIC
 
@@ -44,7 +45,7 @@ def initial_state(scene: Scene, model: mujoco.MjModel) -> mujoco.MjData:
     known = dict(zip(ours.spanning_names, zip(q, v, strict=True), strict=True))
     for joint in range(1 if scene.robot.floating else 0, model.njnt):
         address, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-        data.qpos[address], data.qvel[dof] = known[model.joint(joint).name]
+        data.qpos[address], data.qvel[dof] = known[model.body(model.jnt_bodyid[joint]).name]
     return data
 
 
@@ -57,8 +58,9 @@ def forces(scene: Scene, model: mujoco.MjModel, hold: int, level: str) -> Array:
             names, of = tuple(elastic.rotor for elastic in scene.robot.elastic), ratios(scene.robot)
             W = np.array([[of[rotor].get(joint, 0.0) for joint in scene.robot.independent] for rotor in names])
             torques = np.linalg.solve(W.T, torques)
+        rows = joint_rows(model)
         for name, torque in zip(names, torques, strict=True):
-            force[model.joint(name).dofadr[0]] = torque
+            force[rows[name][1]] = torque
     if scene.push is not None:  # at the origin of the base, which is its centre of mass
         force[:3] += model.body_mass[1] * scene.push[hold]
     return force
@@ -140,5 +142,6 @@ class Peer:
 
 def positions(scene: Scene, model: mujoco.MjModel, qpos: Array) -> Array:
     """Convert positions from MuJoCo to coordinates of ce_gym, shape (..., nq)."""
-    joints = [model.joint(name).qposadr[0] for name in scene.robot.independent]
+    rows = joint_rows(model)
+    joints = [rows[name][0] for name in scene.robot.independent]
     return qpos[..., [*range(7 if scene.robot.floating else 0), *joints]]

@@ -48,13 +48,13 @@ def ratios(robot: Robot) -> dict[str, dict[str, float]]:
 
 def tendons(scene: Scene, spec: mujoco.MjSpec) -> None:
     """Add tendons between rotors and joints, whose length is the stretch, with stiffness and damping."""
-    of = ratios(scene.robot)
+    of, joint_name = ratios(scene.robot), scene.robot.joint_name
     for elastic in scene.robot.elastic:
         tendon = spec.add_tendon(name=f"{elastic.rotor}_spring", springlength=[0.0, 0.0])
         tendon.stiffness[0], tendon.damping[0] = elastic.stiffness, elastic.damping
-        tendon.wrap_joint(elastic.rotor, 1.0)
+        tendon.wrap_joint(joint_name(elastic.rotor), 1.0)
         for joint, ratio in of[elastic.rotor].items():
-            tendon.wrap_joint(joint, -ratio)
+            tendon.wrap_joint(joint_name(joint), -ratio)
 
 
 def capsules(scene: Scene, spec: mujoco.MjSpec) -> None:

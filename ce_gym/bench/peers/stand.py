@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.export.mujoco_batch import Batch
-from ce_gym.export.mujoco_coordinates import Coordinates
+from ce_gym.export.mujoco_coordinates import Coordinates, joint_rows
 from ce_gym.model import Robot
 from ce_gym.sim import Simulator
 
@@ -80,7 +80,8 @@ def watch_mujoco(batch: Batch, robot: Robot, coordinates: Coordinates) -> Behavi
     batch.states[:] = states[:, -1]
     q, v = batch.split(states[:, before * n :])
     base = (7, 6) if robot.floating else (0, 0)
-    joints = [batch.model.joint(name).dofadr[0] for name in robot.independent]
+    rows = joint_rows(batch.model)
+    joints = [rows[name][1] for name in robot.independent]
     spanning = q[..., base[0] :]
     y = spanning[..., [i - base[1] for i in joints]]
     slip = spanning - y @ coordinates.to_positions.T - coordinates.offset

@@ -20,6 +20,7 @@ from ce_gym.bench.accuracy.statements import ratios
 from ce_gym.dynamics.forces.scene import StepOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping.trace import step_function
+from ce_gym.export.mujoco_coordinates import joint_rows
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.mechanism import ELASTIC
 
@@ -83,7 +84,8 @@ class _Constrained:
         self.mass = np.zeros((self.model.nv, self.model.nv))
         loops = any(not isinstance(tie, LinearConstraint) for tie in scene.robot.constraints)
         self.moving_jacobian = loops
-        self.dofs = [self.model.joint(name).dofadr[0] for name in scene.robot.independent]
+        rows = joint_rows(self.model)
+        self.dofs = [rows[name][1] for name in scene.robot.independent]
         self.basis: tuple[Array, Array] | None = None
 
     def rate(self, y: Array, hold: int) -> Array:
@@ -150,10 +152,10 @@ def springs(scene: Scene, model: mujoco.MjModel) -> Callable[[Array, Array], Arr
     """Return a function for the generalised forces of transmission springs in MuJoCo's coordinates."""
     if scene.exact != ELASTIC:
         return lambda qpos, qvel: np.zeros(model.nv)
-    ties, stretch = ratios(scene.robot), np.zeros((len(scene.robot.elastic), model.nv))
+    ties, rows, stretch = ratios(scene.robot), joint_rows(model), np.zeros((len(scene.robot.elastic), model.nv))
     for row, elastic in zip(stretch, scene.robot.elastic, strict=True):
         for name, ratio in {elastic.rotor: -1.0, **ties[elastic.rotor]}.items():
-            row[model.joint(name).dofadr[0]] = -ratio
+            row[rows[name][1]] = -ratio
     k, d = (np.array([getattr(e, figure) for e in scene.robot.elastic]) for figure in ("stiffness", "damping"))
     return lambda qpos, qvel: stretch.T @ (k * (stretch @ qpos) + d * (stretch @ qvel))
 
