@@ -57,8 +57,8 @@ class Call:
             independent of their neighbours, the call must change nothing in a lane where the buffer is zero.
         times: number of applications of the function. A buffer that is `times` as large as its argument is traversed
             argument by argument; all others are the same in every application.
-        short_if_zero: an output of size 1 that the function itself chooses by. Tiles where the output is zero in all
-            lanes execute a shorter variant of the function, with the same bits.
+        short_if_zero: outputs of size 1 that the function itself chooses by. Tiles where such an output is zero in all
+            lanes skip the operations that matter elsewhere only, with the same bits.
         again: the only inputs that have changed since the previous call, which is of the same function. Operations that
             depend on no other changes are not repeated.
     """
@@ -68,7 +68,7 @@ class Call:
     outputs: tuple[str, ...]
     only_if: str = ""
     times: int = 1
-    short_if_zero: str = ""
+    short_if_zero: tuple[str, ...] = ()
     again: tuple[str, ...] = ()
 
 
@@ -243,10 +243,10 @@ def check_program(program: Program) -> None:
             if call.only_if:
                 _check_flag(f"{place}: only_if", buffers.get(call.only_if))
                 read = (*read, call.only_if)
-            if call.short_if_zero:
-                _check_flag(f"{place}: short_if_zero", buffers.get(call.short_if_zero))
-                if call.short_if_zero not in call.outputs:
-                    raise ValueError(f"{place}: short_if_zero {call.short_if_zero!r}, expected one of its outputs")
+            for name in call.short_if_zero:
+                _check_flag(f"{place}: short_if_zero", buffers.get(name))
+                if name not in call.outputs:
+                    raise ValueError(f"{place}: short_if_zero {name!r}, expected one of its outputs")
         if unset := [name for name in read if name not in written]:
             raise ValueError(f"{place}: reads {unset[0]!r}, expected an earlier call to write it first")
         written.update(call.outputs)

@@ -50,7 +50,6 @@ NO_TERMS: dict[str, Any] = {"rewards": {}, "noise": {}, "history": 1} | {f: () f
 BARE: dict[str, Any] = {
     "control": "torque",
     "contacts": (),
-    "seldom": (),
     "self_collisions": (),
     "ground": "flat",
     "motors": "ideal",
@@ -61,7 +60,6 @@ BARE: dict[str, Any] = {
 """Options of the smallest scene."""
 OPTION_NAMES = {
     "contacts": "contact",
-    "seldom": "contacts seldom near, where they are",
     "self_collisions": "pairs of links, where they are near",
     "ground": "ground field",
     "motors": "limited motors",

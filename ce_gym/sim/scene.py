@@ -46,12 +46,10 @@ def resolve_scene(
     """
     check_choice("control", control, get_args(Control))
     contacts = select_contacts(model.robot, scene.contacts)
-    seldom = select_contacts(model.robot, scene.seldom, "seldom")
     resolved = {
         "dt": None,  # kernels read both from buffers
         "tolerance": None,
         "contacts": contacts,
-        "seldom": tuple(name for name in seldom if name in contacts),
         "self_collisions": select_pairs(model.mechanism, scene.self_collisions),
         "ground": "field" if terrain is not None and contacts else "flat",
         "hulls": hulls_on(model.robot, contacts, terrain),
@@ -64,13 +62,12 @@ def resolve_scene(
     return options
 
 
-def select_contacts(robot: Robot, contacts: str | Sequence[str], argument: str = "contacts") -> tuple[str, ...]:
+def select_contacts(robot: Robot, contacts: str | Sequence[str]) -> tuple[str, ...]:
     """Return names of contact spheres, in the robot's order.
 
     Args:
         robot: The robot.
         contacts: "all", or names of spheres or groups of spheres, one or several.
-        argument: Name of the argument in errors.
 
     Raises:
         ValueError: If a name is not a sphere or a group, or is listed twice.
@@ -78,7 +75,7 @@ def select_contacts(robot: Robot, contacts: str | Sequence[str], argument: str =
     names = [contacts] if isinstance(contacts, str) else list(contacts)
     known = sorted({c.group for c in robot.contacts} | {c.name for c in robot.contacts})
     listed = [name for name in names if name != "all"]
-    check_names(argument, listed, known, "'all', groups or names among")
+    check_names("contacts", listed, known, "'all', groups or names among")
     wanted = set(names)
     return tuple(c.name for c in robot.contacts if wanted & {"all", c.group, c.name})
 

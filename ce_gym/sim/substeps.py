@@ -16,7 +16,6 @@ from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import LOAD
 from ce_gym.dynamics.model import Model
 from ce_gym.dynamics.stepping import halving, step_size
-from ce_gym.dynamics.stepping.broad_phase import has_broad_phase
 from ce_gym.dynamics.stepping.ground_lookup import (
     hull_places_function,
     hulls_function,
@@ -26,6 +25,7 @@ from ce_gym.dynamics.stepping.ground_lookup import (
 )
 from ce_gym.dynamics.stepping.trace import (
     NEAR,
+    NEAR_ITERATE,
     balance_function,
     combination_function,
     conserve_function,
@@ -50,8 +50,8 @@ HEIGHTS = "heights"
 """Name of the table with the heights of the ground, on a field."""
 FRAME = "frame"
 """Name of the buffer with the frame of that table for each robot: x, y of the first entry and the cell size [m]."""
-ITERATES = NEAR_ITERATE, ITERATE = "near_iterate", "iterate"
-"""Names of the iterates of forces with a broad phase, zero between the stages of steps, and of all other forces."""
+ITERATE = "iterate"
+"""Name of the iterate of forces that are always computed. Those of culled groups are zero between stages of steps."""
 UNCONVERGED = "unconverged"
 """Name of the buffer that says whether a robot needs another iteration."""
 
@@ -112,15 +112,16 @@ def substeps(
     options, plan = replace(options, dt=None), METHODS[options.method]
     step = StepVariables(mechanism, options, outputs)
     if step.stages:
-        function = iteration_function(mechanism, options, step.evaluated, False, has_broad_phase(options), False)
+        function = iteration_function(mechanism, options, step.evaluated, culls=True, conserves=False)
     else:
         function = step_function(mechanism, options, step.evaluated)
-    computed = (*ITERATES, BALANCE, "ground", "region_points")
+    culled = [name for name in function.name_in() if name.startswith(NEAR_ITERATE)]
+    computed = (ITERATE, *culled, BALANCE, "ground", "region_points")
     sizes = {name: function.numel_in(name) for name in function.name_in() if name not in computed}
     sizes |= {"retries": 1, **step.outputs} | ({FRAME: 3} if "ground" in function.name_in() else {})
     sizes |= step_size.control_sizes(mechanism.robot.layout) if plan.controlled else {}
 
-    clear = [_clear(function, NEAR_ITERATE)] if NEAR_ITERATE in function.name_in() else []
+    clear = [_clear(function, name) for name in culled]
     begin = call((step_size if plan.controlled else halving).begin_function(step))
     stages = _stages if step.stages else _one_call
     tries = (*stages(mechanism, options, step, function), *_accept(mechanism, options, step))
@@ -138,8 +139,10 @@ def _stages(
     A tile iterates again only if one of its robots has not converged; the others reproduce their results.
     """
     plan = METHODS[options.method]
-    iterates = tuple(name for name in ITERATES if name in iteration.name_in())
-    in_range = NEAR if NEAR in iteration.name_out() else ""
+    culled = {
+        NEAR + name.removeprefix(NEAR_ITERATE): name for name in iteration.name_in() if name.startswith(NEAR_ITERATE)
+    }
+    iterates = (*culled.values(), *([ITERATE] if ITERATE in iteration.name_in() else []))
     on_field, looked_up_at = "ground" in iteration.name_in(), None
     for stage in plan.stages:
         assert isinstance(stage.start, str), "explicit stages do not iterate"
@@ -152,11 +155,10 @@ def _stages(
             inputs[LOAD] = start[stage.load].name
         if ITERATE in iterates:
             yield _clear(iteration, ITERATE)
-        first = call(iteration, inputs, end.names, short_if_zero=in_range)
+        first = call(iteration, inputs, end.names, short_if_zero=tuple(culled))
         yield first
         yield from [replace(first, only_if=UNCONVERGED, again=iterates)] * step.iterations[stage.name]
-        if in_range:
-            yield _clear(iteration, NEAR_ITERATE, only_if=in_range)
+        yield from [_clear(iteration, name, only_if=flag) for flag, name in culled.items()]
         yield call(conserve_function(mechanism, options), {**end.names, DT: end.dt.name}, end.names)
     if not plan.single:
         yield call(combination_function(mechanism, options, step), {DT: step.tried.dt.name}, step.tried.names)

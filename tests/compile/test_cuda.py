@@ -116,7 +116,7 @@ def test_each_thread_takes_the_short_way_by_itself(dtype, needs_host_compiler):
     flag = z > 0.5
     function = ca.Function("choosing", [x, z], [x * x + x + ca.if_else(flag, ca.sin(x * x), 0), flag])
     buffers = (Buffer("x", 1, "rows_in"), Buffer("z", 1, "rows_in"), Buffer("flag", 1, "scratch"))
-    calls = (Call(function, ("x", "z"), ("found", "flag"), short_if_zero="flag"),)
+    calls = (Call(function, ("x", "z"), ("found", "flag"), short_if_zero=("flag",)),)
     program = Program("cuda short", (*buffers, Buffer("found", 1, "rows_out")), calls)
     rows = {"x": np.random.default_rng(0).normal(size=(N, 1)), "z": (np.arange(N) % 11 == 0)[:, None]}
     llvm, cuda = run_both(program, {name: row.astype(dtype) for name, row in rows.items()}, dtype)

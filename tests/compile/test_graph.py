@@ -13,7 +13,6 @@ from ce_gym.compile.lowering.graph import (
     FMA,
     FMS,
     FNMA,
-    KEPT,
     NO_OPERATION,
     REMOVED,
     SELECT,
@@ -137,17 +136,21 @@ CHOICE = 2
 
 def test_what_is_left_where_a_choice_is_zero():
     """Choices are made, dead code is removed, and operations that the full function does not fuse stay unfused."""
-    says, whole, left = variants_of(choosing(), CHOICE)
-    assert sorted(operations(says.graph)) == sorted([ca.OP_ADD, ca.OP_LT])
-    assert operations(whole.graph) == operations(graph_of(choosing()))
-    assert ca.OP_SIN in operations(whole.graph)
-    assert sorted(operations(left.graph)) == sorted([ca.OP_MUL, ca.OP_ADD, ca.OP_LT, ca.OP_OR])
+    says, whole, left = map(executed, variants_of(choosing(), [CHOICE]))
+    assert sorted(says) == sorted([ca.OP_ADD, ca.OP_LT])
+    assert ca.OP_SIN in whole
+    assert sorted(whole) == sorted(operations(graph_of(choosing())))
+    assert sorted(left) == sorted([ca.OP_MUL, ca.OP_ADD, ca.OP_LT, ca.OP_OR])
     alone = graph_of(ca.Function("alone", [X, Y], [X * Y + X, X < 0]))
     assert FMA in operations(alone)
 
 
 def operations(graph):
     return [op for op in graph.ops if op not in NO_OPERATION]
+
+
+def executed(fragment):
+    return [fragment.graph.ops[k] for k in fragment.nodes]
 
 
 def test_a_tile_takes_the_short_way_to_the_same_bits():
@@ -158,7 +161,7 @@ def test_a_tile_takes_the_short_way_to_the_same_bits():
         buffers = [Buffer(name, 1, "tiles") for name in ("x", "y", "z", *NAMES[1])]
         return Program("choosing", tuple(buffers), (Call(function, *NAMES, short_if_zero=short),))
 
-    for short in ("", "choice"):
+    for short in ((), ("choice",)):
         kernel = load_kernel(f"choosing {short}", partial(program, short), "float64")
         n = 3 * kernel.lanes
         rows = np.random.default_rng(2).uniform(-1, 1, (3, n))
@@ -202,7 +205,7 @@ def growing():
 GIVEN, LEFT = ("x", "y", "z"), ("value", "z", "flag", "choice")
 
 
-def growing_program(again, short=""):
+def growing_program(again, short=()):
     function, first = growing(), ca.Function("first", [X], [0.5 + ca.if_else(X > 2, X, 0)])
     calls = [Call(first, ("x",), ("z",)), Call(function, GIVEN, LEFT, short_if_zero=short)]
     calls += [Call(function, GIVEN, LEFT, only_if="flag", short_if_zero=short, again=again)] * 3
@@ -210,32 +213,99 @@ def growing_program(again, short=""):
     return Program("growing", (*buffers, Buffer("z", 1, "scratch"), Buffer("flag", 1, "scratch")), tuple(calls))
 
 
-def test_what_does_not_depend_on_an_iterate_is_in_the_prologue():
-    parts = split_function(growing(), frozenset({2}))
-    (none, second), first = *parts.variants, parts.prologue.graph
-    assert none.is_empty
-    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} <= set(operations(first))
-    assert not {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} & set(operations(second.graph))
-    assert sorted(operations(first) + operations(second.graph)) == sorted(operations(graph_of(growing())))
-    assert parts.prologue.keeps == {k for k, op in enumerate(second.graph.ops) if op == KEPT} != set()
+def crowding():
+    """A function of x, y and an iterate z, two flags of which switch terms on that later terms contain.
+
+    Each flag has an iterate that only the flag changes, and a product that both flags need.
+    """
+    near, far = X > 0, Y > 0
+    left, right, shared = ca.sin(X) * Z, ca.sqrt(Y * Y + 1) + Z, ca.exp(-X * X)
+    one = ca.if_else(near, shared + left, shared)
+    both = ca.if_else(far, one + right * right, one)
+    total = both + ca.if_else(near, ca.if_else(far, left * right, 0), 0) + ca.if_else(far, ca.cos(total_of(both)), 0)
+    held, kept = ca.SX.sym("held"), ca.SX.sym("kept")
+    next_held, next_kept = ca.if_else(near, held + total, held), ca.if_else(far, kept * 0.5 + left, kept)
+    outputs = [total, 0.3 * total + Z, next_held, next_kept, total < 3, near, far]
+    return ca.Function("crowding", [X, Y, Z, held, kept], outputs)
 
 
-def test_what_only_a_flag_needs_is_in_a_variant():
-    """The root is in the full variant only, cheap values of the flag are recomputed, and the sine is always needed."""
-    parts = split_function(growing(), frozenset({2}), LEFT.index("choice"))
-    (before, last), (none, left) = parts.variants
-    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_LT} <= set(operations(parts.prologue.graph))
-    assert ca.OP_SQRT not in operations(parts.prologue.graph)
-    assert {ca.OP_SQRT, ca.OP_EXP} <= set(operations(before.graph))
-    assert none.is_empty
-    assert len(operations(left.graph)) < len(operations(last.graph))
-    assert parts.prologue.outputs | last.outputs == parts.prologue.outputs | left.outputs == set(range(len(LEFT)))
-    with pytest.raises(ValueError, match="output 2 is a choice; expected one that does not follow"):
-        split_function(growing(), frozenset({2}), LEFT.index("flag"))
+def total_of(x):
+    """A number that takes several operations."""
+    return x * x + 1 / (1 + x * x)
+
+
+CROWD = (("x", "y", "z", "held", "kept"), ("value", "z", "held", "kept", "flag", "near", "far"))
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("short", ["", "choice"])
+def test_each_flag_skips_its_operations_alone_to_the_same_bits(dtype):
+    """Tiles in which no robot, some or all robots have neither flag, one or both."""
+    results = []
+    for short in ((), ("near", "far"), ("far", "near")):
+        function, iterates = crowding(), ("z", "held", "kept")
+        calls = [Call(function, *CROWD, short_if_zero=short)]
+        calls += [Call(function, *CROWD, only_if="flag", short_if_zero=short, again=iterates)] * 3
+        names = (*CROWD[0], *(name for name in CROWD[1] if name not in CROWD[0]))
+        program = Program("crowding", tuple(Buffer(name, 1, "tiles") for name in names), tuple(calls))
+        kernel = load_kernel(f"crowding {short}", lambda program=program: program, dtype)
+        n, rng = 8 * kernel.lanes, np.random.default_rng(3)
+        arrays = {name: aligned(rng.uniform(0.5, 1, (8, 1, kernel.lanes)).astype(dtype)) for name in names}
+        for tile in range(6):
+            arrays["x"][tile] *= (-1, 1, -1, 1)[tile % 4]
+            arrays["y"][tile] *= (-1, -1, 1, 1)[tile % 4]
+        arrays["x"][6:, :, ::3] *= -1
+        arrays["y"][6:, :, ::2] *= -1
+        kernel(arrays, n)
+        results.append([arrays[name].copy() for name in names])
+    assert len({tuple(array.tobytes() for array in result) for result in results}) == 1
+    assert np.isfinite(results[0]).all()
+
+
+def test_parts_of_several_flags_are_as_many_as_flags():
+    """Operations of a flag are no other flag's, and all are executed once or as recomputed constants."""
+    parts = split_function(crowding(), {2, 3, 4}, [5, 6], {(2, 1), (3, 2), (4, 3)})
+    of_flags = [{k for part in parts.parts if part.flag == flag for k in part.fragment.nodes} for flag in (5, 6)]
+    assert not of_flags[0] & of_flags[1]
+    assert all(of_flags)
+    graph = parts.first.graph
+    assert {graph.ops[k] for k in of_flags[1]} >= {ca.OP_SQRT, ca.OP_COS}
+    assert ca.OP_SIN not in {graph.ops[k] for k in of_flags[1]}
+    (short,) = [part for part in parts.short if part.fragment.nodes]
+    assert len(short.fragment.nodes) < 8
+
+
+def test_what_does_not_depend_on_an_iterate_is_in_the_prologue():
+    parts = split_function(growing(), {2})
+    (part,) = parts.parts
+    first, second = executed(parts.first), executed(part.fragment)
+    assert not part.constant
+    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} <= set(first)
+    assert not {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} & set(second)
+    before = set(parts.first.nodes)
+    read = {a for k in part.fragment.nodes for a in part.fragment.graph.operands[k]}
+    assert set(parts.first.keeps.values()) == read & before != set()
+    needed = graph_of(growing()).ancestors([k for k, op in enumerate(part.fragment.graph.ops) if op == ca.OP_OUTPUT])
+    assert before | {*part.fragment.nodes} == {k for k in needed if graph_of(growing()).ops[k] not in NO_OPERATION}
+
+
+def test_what_only_a_flag_needs_is_in_a_variant():
+    """The root is executed with the flag only, cheap values are recomputed there, and the sine is always needed."""
+    flag = LEFT.index("choice")
+    parts = split_function(growing(), {2}, [flag])
+    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_LT} <= set(executed(parts.first))
+    assert ca.OP_SQRT not in executed(parts.first)
+    constant = [part for part in parts.parts if part.constant]
+    assert {ca.OP_SQRT} <= {op for part in constant if part.flag == flag for op in executed(part.fragment)}
+    assert ca.OP_EXP in {op for part in constant for op in executed(part.fragment)}
+    assert not any(part.constant or part.flag for part in parts.short)
+    counts = [sum(len(part.fragment.nodes) for part in each) for each in (parts.short, parts.parts)]
+    assert counts[0] < counts[1]
+    with pytest.raises(ValueError, match="output 2 is a choice; expected one that does not follow"):
+        split_function(growing(), {2}, [LEFT.index("flag")])
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("short", [(), ("choice",)])
 def test_a_call_again_goes_by_what_the_first_one_left_to_the_same_bits(short, dtype):
     """For loops that end at once, late or never, and for the short variant of the function."""
     results = []
@@ -260,11 +330,11 @@ def test_a_second_iteration_of_a_step_takes_kinematics_from_the_first():
     model = Model("mini_cheetah")
     options = StepOptions(contacts=tuple(c.name for c in model.robot.contacts if c.group == "foot"))
     function = iteration_function(model.mechanism, options, conserves=False)
-    parts = split_function(function, frozenset({function.name_in().index("iterate")}))
-    second = parts.variants[0][-1].graph
-    assert operations(parts.prologue.graph).count(ca.OP_SIN) == 12
-    assert operations(second).count(ca.OP_SIN) == 1
-    assert len(operations(second)) < 0.8 * len(operations(graph_of(function)))
+    parts = split_function(function, {function.name_in().index("iterate")})
+    second = [op for part in parts.parts if not part.constant for op in executed(part.fragment)]
+    assert executed(parts.first).count(ca.OP_SIN) == 12
+    assert second.count(ca.OP_SIN) == 1
+    assert len(second) < 0.8 * len(operations(graph_of(function)))
 
 
 @pytest.mark.parametrize(
@@ -288,6 +358,6 @@ def test_a_call_again_comes_after_one_of_the_same(place, change, message):
 
 def test_the_short_way_goes_by_an_output():
     buffers = tuple(Buffer(name, 1, "tiles") for name in ("x", "y", "z", *NAMES[1], "other"))
-    program = Program("choosing", buffers, (Call(choosing(), *NAMES, short_if_zero="other"),))
+    program = Program("choosing", buffers, (Call(choosing(), *NAMES, short_if_zero=("other",)),))
     with pytest.raises(ValueError, match="short_if_zero 'other', expected one of its outputs"):
         check_program(program)

@@ -123,7 +123,7 @@ class MujocoRobot:
         set_contact_material(self.model, description)
         self.state = mujoco.MjData(self.model)
         self.names = list(self.rng.permutation(spec["joints"]))
-        joints = [self.model.joint(description.links_by_joint[name]).id for name in self.names]
+        joints = [self.model.joint(name).id for name in self.names]
         self.positions, self.velocities = self.model.jnt_qposadr[joints], self.model.jnt_dofadr[joints]
         driven = self.model.actuator_trnid[:, 0].tolist()
         self.motors = [driven.index(joint) for joint in joints]

@@ -54,11 +54,10 @@ def test_keywords_replace_fields_of_the_scene(model: Model):
 
 
 def test_a_task_passes_its_scene_options_on():
-    task = replace(VELOCITY, normal_law="kelvin_voigt", retry=1, seldom="knee", friction="secant")
+    task = replace(VELOCITY, normal_law="kelvin_voigt", retry=1, friction="secant")
     options = resolve_scene(task, Model("mini_cheetah"), None, "position")
     assert isinstance(options, StepOptions)
     assert (options.normal_law, options.retry, options.friction) == ("kelvin_voigt", 1, "secant")
-    assert set(options.seldom) < set(options.contacts)
 
 
 def test_numbers_that_kernels_read_are_no_constants(model: Model):

@@ -8,7 +8,6 @@ robots that fall are not timed on the ground.
 from __future__ import annotations
 
 import tracemalloc
-from collections.abc import Sequence
 from itertools import count, islice
 
 import casadi as ca
@@ -54,11 +53,9 @@ PEAK_REPEATS = 400_000
 """Repeats for several milliseconds, because a core needs time to reach its full speed in vector work."""
 
 
-def sub_steps(
-    model: Model, dtype: str, num_envs: int, num_threads: int, dt: float, seldom: Sequence[str] = ()
-) -> Competitor:
+def sub_steps(model: Model, dtype: str, num_envs: int, num_threads: int, dt: float) -> Competitor:
     """Return calls of `Simulator.step` with copying of targets; one unit of work is one robot's sub-step."""
-    sim = Simulator(model, num_envs, dt, dtype, num_threads, seldom=seldom)
+    sim = Simulator(model, num_envs, dt, dtype, num_threads)
     start, made = sim.snapshot(), count()
     calls = max(1, ROBOT_CALLS // num_envs)
     targets = np.ascontiguousarray(stand.targets(model.robot, num_envs, TARGETS, seed=2).swapaxes(0, 1))

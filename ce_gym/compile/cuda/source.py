@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any
+from typing import Any, TypeAlias
 
 import casadi
 import numpy as np
@@ -22,7 +22,7 @@ from ce_gym.compile.cuda.limbs import Group, Slots, fold, limb_slots, lower_limb
 from ce_gym.compile.cuda.prelude import prelude
 from ce_gym.compile.cuda.writer import Writer
 from ce_gym.compile.layout import Layout, layout_of
-from ce_gym.compile.lowering.function import Arguments, lower_function, variants_of
+from ce_gym.compile.lowering.function import Arguments, arguments_of, lower_function, variants_of
 from ce_gym.compile.lowering.graph import graph_of
 from ce_gym.compile.lowering.partial_evaluation import Fragment
 from ce_gym.compile.program import Buffer, Call, Grid, Lookup, Program, Repeat, Step, While, check_program
@@ -37,6 +37,7 @@ LONG = 500
 """Functions with several callers and more instructions are called; others are inlined."""
 ENTRY = "run"
 """Name of the kernel in its source."""
+Flags: TypeAlias = tuple[int, ...]
 C_TYPES = {"float64": "double", "float32": "float"}
 
 
@@ -112,8 +113,8 @@ class _KernelText:
     def __init__(self, program: Program, layout: Layout):
         self.program, self.layout = program, layout
         self.sizes = {b.name: b.size for b in program.buffers}
-        self.names: dict[tuple[casadi.Function, int | None, int], str] = {}
-        self.n_calls: Counter[tuple[casadi.Function, int | None, int]] = Counter()
+        self.names: dict[tuple[casadi.Function, Flags, int], str] = {}
+        self.n_calls: Counter[tuple[casadi.Function, Flags, int]] = Counter()
         self.grids: dict[Grid, str] = {}
         self.calls: dict[casadi.Function, Call] = {}
 
@@ -216,16 +217,16 @@ class _KernelText:
         yield f"    {call}"
 
     def _variant(self, call: Call) -> str:
-        """Return the call of the full function, or of its flag and then of the variant that the flag selects."""
-        short = call.short_if_zero
+        """Return the call of the full function, or of its flags and then of the variant that the flags select."""
         values = self.first_argument + ", ".join(f"{name}_" for name in (*call.inputs, *call.outputs))
         self.calls[call.function] = call
-        if not short:
+        if not call.short_if_zero:
             return f"{self._function(call.function)}({values});"
-        flag = call.outputs.index(short)
-        names = (self._function(call.function, flag, variant) for variant in range(3))
-        find_flag, full, reduced = (f"{name}({values});" for name in names)
-        return f"{{ {find_flag} if ({self._is_set(short)}) {full} else {reduced} }}"
+        flags = tuple(call.outputs.index(name) for name in call.short_if_zero)
+        names = (self._function(call.function, flags, variant) for variant in range(3))
+        find_flags, full, reduced = (f"{name}({values});" for name in names)
+        matters = " || ".join(map(self._is_set, call.short_if_zero))
+        return f"{{ {find_flags} if ({matters}) {full} else {reduced} }}"
 
     def _look_up(self, lookup: Lookup) -> str:
         n, table = self.sizes[lookup.points] // 2, lookup.table
@@ -236,12 +237,12 @@ class _KernelText:
         name = "look_up" if lookup.slopes else "look_up_values"
         return f"{name}<{n}>(all_{table}, rows_{table}, columns_{table}, {lanes});"
 
-    def _function(self, function: casadi.Function, flag: int | None = None, variant: int = 1) -> str:
+    def _function(self, function: casadi.Function, flags: Flags = (), variant: int = 1) -> str:
         """Return the name of the C function of a traced function, and count one more call.
 
-        A function with a flag, the number of an output, has three variants, see `variants_of`.
+        A function with flags, numbers of outputs, has three variants, see `variants_of`.
         """
-        key = function, flag, variant
+        key = function, flags, variant
         self.n_calls[key] += 1
         return self.names.setdefault(key, f"{function.name()}_{len(self.names)}")
 
@@ -256,10 +257,10 @@ class _KernelText:
     def functions(self) -> list[str]:
         """Return the C functions that have been named: inlined, except long ones with several calls."""
         texts = []
-        for (function, flag, variant), name in self.names.items():
-            is_called = self.n_calls[function, flag, variant] > 1 and function.n_instructions() > LONG
+        for (function, flags, variant), name in self.names.items():
+            is_called = self.n_calls[function, flags, variant] > 1 and function.n_instructions() > LONG
             inline = "__noinline__" if is_called else "__forceinline__"
-            fragment = None if flag is None else variants_of(function, flag)[variant]
+            fragment = variants_of(function, flags)[variant] if flags else None
             texts.append(self._function_text(name, function, inline, fragment))
         return texts
 
@@ -276,7 +277,7 @@ class _KernelText:
         inputs = [f"in{i}" for i in range(function.n_in())]
         outputs = [f"out{i}" for i in range(function.n_out())]
         writer: Any = Writer(self.layout.dtype)  # has the methods of the vector builder
-        self._lower(writer, function, Arguments(inputs, outputs), fragment)
+        self._lower(writer, function, Arguments(dict(enumerate(inputs)), dict(enumerate(outputs))), fragment)
         arguments = [f"const real* {name}" for name in inputs] + [f"real* {name}" for name in outputs]
         head = f"static __device__ {inline} void {name}({self._first_parameter}{', '.join(arguments)})"
         return "\n".join([head, "{", *_indented(writer.lines), "}", ""])
@@ -354,7 +355,7 @@ class _LimbText(_KernelText):
 
     def _lower(self, writer: Any, function: casadi.Function, arguments: Arguments, fragment: Fragment | None) -> None:
         call, graph = self.calls[function], fragment.graph if fragment else graph_of(function)
-        folded = fold(call, graph, self.slots, sorted(fragment.outputs) if fragment else None)
+        folded = fold(call, graph, self.slots, arguments_of(function, fragment)[1] if fragment else None)
         for bit in range(self.threads.bit_length() - 1):
             writer.lines.append(f"const mask limb_{2**bit} = (limb & {2**bit}) != 0;")
         lower_limb(writer, folded, arguments)

@@ -8,15 +8,14 @@ inputs are stored at once, which keeps fewer values alive.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi
 
 from ce_gym.compile.lowering import math as vector_math
-from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, KEPT, SELECT, Graph, graph_of, sources
-from ce_gym.compile.lowering.ordering import ordered
-from ce_gym.compile.lowering.partial_evaluation import Fragment, Split, split, variants
+from ce_gym.compile.lowering.graph import FMA, FMS, FNMA, SELECT, Graph, graph_of, sources
+from ce_gym.compile.lowering.partial_evaluation import Fragment, Split, split, variants, whole
 from ce_gym.compile.lowering.vector import Value, VectorBuilder
 
 
@@ -25,15 +24,16 @@ class Arguments:
     """Memory that a lowered function works on; vectors of an input or output follow each other column by column.
 
     Attributes:
-        inputs: Pointer to the first vector of each input of the function.
-        outputs: Pointer to the first vector of each output; structural zeros are written as 0.
+        inputs: Pointer to the first vector of each input of the function that is read, by number.
+        outputs: Pointer to the first vector of each output that is written, by number; structural zeros are written
+            as 0.
         kept: Pointer to the values that the fragments of a function keep for each other.
         disjoint: Whether no output shares memory with an input.
         shared: Pairs of an input and an output that share memory; values that do not change are not stored again.
     """
 
-    inputs: Sequence[Value]
-    outputs: Sequence[Value]
+    inputs: Mapping[int, Value]
+    outputs: Mapping[int, Value]
     kept: Value | None = None
     disjoint: bool = False
     shared: frozenset[tuple[int, int]] = frozenset()
@@ -47,22 +47,57 @@ def lower_function(
     Raises:
         NotImplementedError: If an operation has no vector form.
     """
-    whole = Fragment(graph_of(function), frozenset(range(function.n_out())))
-    lowering = _Lowering(v, function, arguments, fragment or whole)
+    lowering = _Lowering(v, function, arguments, fragment or whole(graph_of(function), function.n_out()))
     lowering.emit_operations()
     lowering.emit_stores()
 
 
-def split_function(function: casadi.Function, changing: frozenset[int], flag: int | None = None) -> Split:
-    """Split a function, given the numbers of its inputs that change and of its output that is a flag; see `split`."""
-    graph = graph_of(function)
-    return split(graph, _outputs(function, graph), sources(function, graph, changing), flag)
+def arguments_of(function: casadi.Function, fragment: Fragment) -> tuple[list[int], list[int]]:
+    """Return the numbers of the inputs that a fragment of a function reads and of the outputs that it writes."""
+    graph = fragment.graph
+    read = {a for k in fragment.nodes for a in graph.operands[k]} | {
+        *fragment.stores.values(),
+        *fragment.keeps.values(),
+    }
+    inputs = {function.instruction_input(k)[0] for k in read if graph.ops[k] == casadi.OP_INPUT}
+    outputs = {function.instruction_output(k)[0] for k in fragment.stores} | fragment.zeros
+    return sorted(inputs), sorted(outputs)
 
 
-def variants_of(function: casadi.Function, flag: int) -> tuple[Fragment, Fragment, Fragment]:
-    """Return the flag of a function, the full function, and the function where the flag is zero; see `variants`."""
+def split_function(
+    function: casadi.Function,
+    changing: Collection[int],
+    flags: Sequence[int] = (),
+    shared: Collection[tuple[int, int]] = (),
+) -> Split:
+    """Split a function, see `split`.
+
+    Args:
+        function: The function.
+        changing: Numbers of its inputs that change.
+        flags: Numbers of its outputs that are flags.
+        shared: Pairs of an input and an output that share memory.
+    """
     graph = graph_of(function)
-    return variants(graph, _outputs(function, graph), flag)
+    positions = [dense_positions(function.sparsity_in(i)) for i in range(function.n_in())]
+    inputs: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for k in sources(function, graph, {i for i, _ in shared}):
+        number, nonzero = function.instruction_input(k)
+        inputs[number, positions[number][nonzero]].append(k)
+    outputs, overlaps = _outputs(function, graph), defaultdict(list)
+    for i, j in shared:
+        written = dense_positions(function.sparsity_out(j))
+        for k in outputs[j]:
+            overlaps[k] += inputs[i, written[function.instruction_output(k)[1]]]
+    late = {j for _, j in shared}
+    zeros = {i: i in late for i in range(function.n_out()) if function.nnz_out(i) < function.numel_out(i)}
+    return split(graph, outputs, sources(function, graph, changing), flags, overlaps, zeros)
+
+
+def variants_of(function: casadi.Function, flags: Sequence[int]) -> tuple[Fragment, Fragment, Fragment]:
+    """Return the flags of a function, the full function, and the function where all flags are zero; see `variants`."""
+    graph = graph_of(function)
+    return variants(graph, _outputs(function, graph), flags)
 
 
 def _outputs(function: casadi.Function, graph: Graph) -> list[set[int]]:
@@ -87,6 +122,7 @@ class _Lowering:
         values: Value of each node that has been emitted.
         loaded: Values that have been loaded, by number of the input and position in the input.
         stored: Outputs that have been stored, by number and position.
+        places: Places among the values that fragments keep that each node is written to.
         destinations: Outputs that each node is written to, by number and position.
     """
 
@@ -97,36 +133,42 @@ class _Lowering:
         self.values: dict[int, Value] = {}
         self.loaded: dict[tuple[int, int], Value] = {}
         self.stored: set[tuple[int, int]] = set()
+        self.places: dict[int, list[int]] = defaultdict(list)
+        for slot, k in fragment.keeps.items():
+            self.places[k].append(slot)
         self.destinations: dict[int, list[tuple[int, int]]] = defaultdict(list)
         positions = [dense_positions(function.sparsity_out(i)) for i in range(function.n_out())]
-        for k, op in enumerate(fragment.graph.ops):
-            if op == casadi.OP_OUTPUT:
-                number, nonzero = function.instruction_output(k)
-                self.destinations[fragment.graph.operands[k][0]].append((number, positions[number][nonzero]))
+        for output, k in fragment.stores.items():
+            number, nonzero = function.instruction_output(output)
+            self.destinations[k].append((number, positions[number][nonzero]))
 
     def emit_operations(self) -> None:
         """Emit all operations, and the stores of values that later fragments read or that overwrite no input."""
         graph, arguments = self.fragment.graph, self.arguments
-        for k in ordered(graph):
+        for k in self.fragment.nodes:
             value = self.operations.emit(graph.ops[k], [self._value(a) for a in graph.operands[k]])
             self.values[k] = value
-            if k in self.fragment.keeps:
-                self.v.store(value, arguments.kept, self.fragment.slots[k])
+            for slot in self.places.pop(k, ()):
+                self.v.store(value, arguments.kept, slot)
             for number, position in self.destinations.get(k, ()) if arguments.disjoint else ():
                 self.v.store(value, arguments.outputs[number], position)
                 self.stored.add((number, position))
+        for k, slots in self.places.items():
+            for slot in slots:
+                self.v.store(self._value(k), arguments.kept, slot)
 
     def emit_stores(self) -> None:
         """Emit the stores of all outputs that have not been stored yet and may have changed."""
         zero = self.v.const(0.0)
-        results = [[zero] * self.function.numel_out(i) for i in range(self.function.n_out())]
+        results: dict[tuple[int, int], Value] = {}
+        for number in self.fragment.zeros:
+            structural = set(dense_positions(self.function.sparsity_out(number)))
+            results |= {(number, i): zero for i in range(self.function.numel_out(number)) if i not in structural}
         for k, places in self.destinations.items():
-            for number, position in places:
-                results[number][position] = self._value(k)
-        for number in sorted(self.fragment.outputs):
-            for position, result in enumerate(results[number]):
-                if (number, position) not in self.stored and not self._is_unchanged(number, position, result):
-                    self.v.store(result, self.arguments.outputs[number], position)
+            results |= {place: self._value(k) for place in places if place not in self.stored}
+        for (number, position), result in sorted(results.items(), key=lambda item: item[0]):
+            if not self._is_unchanged(number, position, result):
+                self.v.store(result, self.arguments.outputs[number], position)
 
     def _value(self, k: int) -> Value:
         """Return the value of a node: computed already, or an input, constant or kept value at its first use."""
@@ -134,7 +176,7 @@ class _Lowering:
             graph = self.fragment.graph
             if k in graph.constants:
                 self.values[k] = self.operations.constant(graph.constants[k])
-            elif graph.ops[k] == KEPT:
+            elif k in self.fragment.slots:
                 self.values[k] = self.v.load(self.arguments.kept, self.fragment.slots[k])
             else:
                 number, nonzero = self.function.instruction_input(k)

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import casadi
 
-REMOVED, SELECT, FMA, FMS, FNMA, KEPT = -1, -2, -3, -4, -5, -6
+REMOVED, SELECT, FMA, FMS, FNMA = -1, -2, -3, -4, -5
 """Operations that CasADi lacks: removed by a rewriting; of (a, b, c): `b if a else c`, `a b + c`, `a b - c`,
-`c - a b`; and a value that another fragment has computed."""
+`c - a b`."""
 
-NO_OPERATION = (casadi.OP_INPUT, casadi.OP_CONST, casadi.OP_OUTPUT, REMOVED, KEPT)
+NO_OPERATION = (casadi.OP_INPUT, casadi.OP_CONST, casadi.OP_OUTPUT, REMOVED)
 """Nothing is computed for these."""
 
 
@@ -117,10 +117,14 @@ def _form_selects(graph: Graph) -> None:
 
 
 def _select_between_sums(graph: Graph) -> None:
-    """Rewrite `b + if_else_zero(c, x)` as `select(c, b + x, b)`: one instruction on CPUs with masked operations."""
+    """Rewrite `b + if_else_zero(c, x)` as `select(c, b + x, b)`: one instruction on CPUs with masked operations.
+
+    Conditions that are outputs may be flags of parts, which must not depend on `b`.
+    """
     ops, operands, users = graph.ops, graph.operands, graph.users()
+    outputs = {operands[k] for k, op in enumerate(ops) if op == casadi.OP_OUTPUT}
     for k, op in enumerate(ops[:]):
-        if op != casadi.OP_IF_ELSE_ZERO or not _has_one_user_a_sum(graph, users[k]):
+        if op != casadi.OP_IF_ELSE_ZERO or not _has_one_user_a_sum(graph, users[k]) or operands[k][:1] in outputs:
             continue
         user, (condition, part) = users[k][0], operands[k]
         left, right = operands[user]

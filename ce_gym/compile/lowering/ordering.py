@@ -7,6 +7,8 @@ the sub-step of a quadruped with 12 joints reloads a sixth fewer spilled values 
 from __future__ import annotations
 
 import heapq
+from collections import defaultdict
+from collections.abc import Collection
 
 import casadi
 
@@ -16,18 +18,28 @@ TWINS = (casadi.OP_SIN, casadi.OP_COS)
 """Operations that share an argument reduction."""
 
 
-def ordered(graph: Graph) -> list[int]:
+def ordered(graph: Graph, nodes: Collection[int] | None = None, outputs: Collection[int] | None = None) -> list[int]:
     """Return the operations, without inputs, constants and outputs, in the order of emission.
+
+    Args:
+        graph: The function.
+        nodes: Operations to order; all if None.
+        outputs: Output nodes that use them; all if None.
 
     Greedy: the next operation is the ready one that is the last user of most operands. Among equals, the operation that
     became ready last is next, because its operands are likely in registers.
     """
     ops, operands = graph.ops, graph.operands
-    users = {k: list(dict.fromkeys(by)) for k, by in graph.users().items()}
-    is_operation = [op not in NO_OPERATION for op in ops]
-    needs = [{a for a in of if is_operation[a]} for of in operands]
-    missing, waiting = [len(of) for of in needs], [len(users.get(k, ())) for k in range(len(ops))]
-    done = [not it for it in is_operation]
+    chosen = sorted([k for k, op in enumerate(ops) if op not in NO_OPERATION] if nodes is None else nodes)
+    if outputs is None:
+        outputs = [k for k, op in enumerate(ops) if op == casadi.OP_OUTPUT]
+    members, done = set(chosen), set[int]()
+    needs = {k: {a for a in operands[k] if a in members} for k in chosen}
+    users: dict[int, list[int]] = defaultdict(list)
+    for k in sorted((*chosen, *outputs)):
+        for a in dict.fromkeys(operands[k]):
+            users[a].append(k)
+    missing, waiting = {k: len(of) for k, of in needs.items()}, {k: len(users[k]) for k in chosen}
     possible: list[tuple[int, int, int]] = []
     order: list[int] = []
 
@@ -36,29 +48,31 @@ def ordered(graph: Graph) -> list[int]:
         heapq.heappush(possible, (-sum(waiting[a] == 1 for a in needs[k]), -len(order), k))
 
     def do(k: int) -> None:
-        done[k] = True
+        done.add(k)
         order.append(k)
         for a in needs[k]:
             waiting[a] -= 1
             if waiting[a] == 1:
                 for user in users[a]:
-                    if not done[user] and missing[user] == 0:
+                    if user in members and user not in done and missing[user] == 0:
                         offer(user)
-        for user in users.get(k, ()):
+        for user in users[k]:
+            if user not in members:
+                continue
             missing[user] -= 1
-            if not done[user] and missing[user] == 0:
+            if user not in done and missing[user] == 0:
                 offer(user)
 
-    for k in range(len(ops)):
-        if not done[k] and missing[k] == 0:
+    for k in chosen:
+        if missing[k] == 0:
             offer(k)
     while possible:
         k = heapq.heappop(possible)[-1]
-        if done[k]:
+        if k in done:
             continue
         do(k)
         if ops[k] in TWINS:
             for twin in users[operands[k][0]]:
-                if ops[twin] in TWINS and not done[twin]:
+                if ops[twin] in TWINS and twin in members and twin not in done:
                     do(twin)
     return order

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import reduce
+from itertools import groupby
 from typing import TypeAlias
 
 import casadi
@@ -11,11 +13,11 @@ from llvmlite import ir
 
 from ce_gym.compile.arrays import ALIGNMENT
 from ce_gym.compile.layout import Layout
-from ce_gym.compile.lowering.function import Arguments, lower_function, split_function
+from ce_gym.compile.lowering.function import Arguments, arguments_of, lower_function, split_function
 from ce_gym.compile.lowering.lookup import Table, emit_lookup
 from ce_gym.compile.lowering.lookup_grid import emit_grid_lookup
 from ce_gym.compile.lowering.lookup_values import emit_value_lookup
-from ce_gym.compile.lowering.partial_evaluation import Fragment, Split
+from ce_gym.compile.lowering.partial_evaluation import Fragment, Part, Split
 from ce_gym.compile.lowering.random import emit_uniform
 from ce_gym.compile.lowering.vector import Builder, Value, VectorBuilder, loop
 from ce_gym.compile.program import Buffer, Call, Foreign, Lookup, Program, Repeat, Step, While
@@ -66,8 +68,8 @@ class _TileWork:
         self.bodies: dict[tuple[casadi.Function, Pairs, Fragment | None], ir.Function] = {}
         repeated = [call for call in program.calls if isinstance(call, Call) and call.again]
         self.changing = {call.function: _changing(call) for call in repeated}
-        self.splits: dict[tuple[casadi.Function, str], Split] = {}
-        self.kept: dict[casadi.Function, Value] = {}
+        self.splits: dict[tuple[casadi.Function, Pairs], Split] = {}
+        self.kept: dict[Split, Value] = {}
 
     def any_lane(self, name: str) -> Value:
         """Return whether a buffer of size 1 is nonzero in some lane."""
@@ -241,50 +243,62 @@ class _TileWork:
             self._call_variant(call)
 
     def _call_variant(self, call: Call) -> None:
-        """Call the full function, or its prologue and the variant of the remainder that some lane needs."""
+        """Call the full function, or those of its parts that some lane needs."""
         split = self._split(call)
         if split is None:
             self._call_body(call)
             return
         if not call.again:
-            self._call_fragment(call, split.prologue)
+            self._call_fragments(call, split, [split.first])
         if not call.short_if_zero:
-            self._call_remainder(call, split.variants[0])
+            self._call_parts(call, split, split.parts)
             return
-        with self.builder.if_else(self.any_lane(call.short_if_zero)) as branches:
-            for branch, variant in zip(branches, split.variants, strict=True):
+        some_flag = reduce(self.builder.or_, map(self.any_lane, call.short_if_zero))
+        with self.builder.if_else(some_flag) as branches:
+            for branch, parts in zip(branches, (split.parts, split.short), strict=True):
                 with branch:
-                    self._call_remainder(call, variant)
+                    self._call_parts(call, split, parts)
+
+    def _call_parts(self, call: Call, split: Split, parts: Sequence[Part]) -> None:
+        """Call parts of a function, or what is executed in their place; of a repeated call those that change."""
+        needed = [part for part in parts if not (call.again and part.constant)]
+        for flag, same in groupby(needed, lambda part: part.flag):
+            group = list(same)
+            if flag is None:
+                self._call_fragments(call, split, [part.fragment for part in group])
+                continue
+            with self.builder.if_else(self.any_lane(call.outputs[flag])) as (some, none):
+                with some:
+                    self._call_fragments(call, split, [part.fragment for part in group])
+                with none:
+                    self._call_fragments(call, split, [part.skipped for part in group])
 
     def _split(self, call: Call) -> Split | None:
-        """Return the fragments of the function; None if the function is called as a whole."""
+        """Return the parts of the function; None if the function is called as a whole."""
         changing = self.changing.get(call.function, frozenset())
         if self.parts > 1 or not (changing or call.short_if_zero):
             return None
-        key = call.function, call.short_if_zero
+        key = call.function, _shared(call)
         if key not in self.splits:
-            flag = call.outputs.index(call.short_if_zero) if call.short_if_zero else None
-            self.splits[key] = split_function(call.function, changing, flag)
+            flags = [call.outputs.index(name) for name in call.short_if_zero]
+            self.splits[key] = split_function(call.function, changing, flags, _shared(call))
         return self.splits[key]
 
-    def _call_remainder(self, call: Call, variant: tuple[Fragment, Fragment]) -> None:
-        """Call the constant and the changing fragment; of a repeated call the changing one."""
-        for fragment in variant[-1:] if call.again else variant:
+    def _call_fragments(self, call: Call, split: Split, fragments: Sequence[Fragment]) -> None:
+        for fragment in fragments:
             if not fragment.is_empty:
-                self._call_fragment(call, fragment)
+                inputs, outputs = arguments_of(call.function, fragment)
+                names = [*(call.inputs[i] for i in inputs), *(call.outputs[i] for i in outputs)]
+                pointers = [self.lanes[name] for name in names]
+                self.builder.call(self._body(call, fragment), [*pointers, self._kept(split)])
 
-    def _call_fragment(self, call: Call, fragment: Fragment) -> None:
-        pointers = [self.lanes[name] for name in call.inputs + call.outputs]
-        self.builder.call(self._body(call, fragment), [*pointers, self._kept(call.function, fragment)])
-
-    def _kept(self, function: casadi.Function, fragment: Fragment) -> Value:
-        """Return the memory for the values that fragments of a function keep for each other, for one tile."""
-        if function not in self.kept:
+    def _kept(self, split: Split) -> Value:
+        """Return the memory for the values that parts of a function keep for each other, for one tile."""
+        if split not in self.kept:
             with self.builder.goto_entry_block():
-                size = INT(max(len(fragment.slots), 1))
-                self.kept[function] = self.builder.alloca(self.vectors.float_type, size)
-            self.kept[function].align = ALIGNMENT
-        return self.kept[function]
+                self.kept[split] = self.builder.alloca(self.vectors.float_type, INT(max(split.size, 1)))
+            self.kept[split].align = ALIGNMENT
+        return self.kept[split]
 
     def _call_body(self, call: Call) -> None:
         """Call the whole function for every part of the lanes, and `times` for parts of the buffers."""
@@ -305,7 +319,7 @@ class _TileWork:
 
     def _body(self, call: Call, fragment: Fragment | None = None) -> ir.Function:
         """Return the LLVM function of a function or a fragment; it is emitted at its first use."""
-        shared = _shared(call) if call.short_if_zero else frozenset()
+        shared = _shared(call) if fragment else frozenset()
         key = call.function, shared, fragment
         if key not in self.bodies:
             self.bodies[key] = self._emitted(call.function, shared, fragment)
@@ -314,14 +328,17 @@ class _TileWork:
     def _emitted(self, function: casadi.Function, shared: Pairs, fragment: Fragment | None) -> ir.Function:
         """Return a function or a fragment as one long block that the optimiser sees alone."""
         pointer = VectorBuilder(None, self.layout.dtype, self.parts).float_type.as_pointer()
-        count = function.n_in() + function.n_out() + (fragment is not None)
+        numbers = range(function.n_in()), range(function.n_out())
+        reads, writes = arguments_of(function, fragment) if fragment else numbers
+        count = len(reads) + len(writes) + (fragment is not None)
         signature = ir.FunctionType(ir.VoidType(), [pointer] * count)
         body = ir.Function(self.builder.module, signature, f"call_{len(self.bodies)}")
         body.linkage = "internal"
         body.attributes.add("noinline")
         body.attributes.alignstack = ALIGNMENT  # else spilled vectors straddle two cache lines each
         vectors = VectorBuilder(ir.IRBuilder(body.append_basic_block("entry")), self.layout.dtype, self.parts)
-        inputs, outputs = body.args[: function.n_in()], body.args[function.n_in() :][: function.n_out()]
+        inputs = dict(zip(reads, body.args, strict=False))
+        outputs = dict(zip(writes, body.args[len(reads) :], strict=False))
         disjoint = self.program.compact and self._is_disjoint(function)
         kept = body.args[-1] if fragment else None
         lower_function(vectors, function, Arguments(inputs, outputs, kept, disjoint, shared), fragment)

@@ -340,7 +340,7 @@ class LinearContact:
         arrived = ca.if_else(self._above, depth - self.law.dt * closing > 0, pushes)
         pulls = ca.logic_and(self.active, self.normal_after(gain) < -FORCE_FLOOR)
         changed = ca.logic_or(slid, ca.if_else(self.active, pulls, arrived))
-        return where(self.law.near, ca.if_else(self.iterate.last, pulls, changed))
+        return ca.if_else(self.iterate.last, pulls, changed)
 
     def next_iterate(self, motion: Motion) -> SX:
         """Return the iterate for another iteration, shape (Iterate.SIZE,)."""

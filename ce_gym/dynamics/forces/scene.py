@@ -33,7 +33,6 @@ class SceneOptions(Options):
 
     Attributes:
         contacts: Contact spheres that can touch the ground: "all", or names of spheres or of groups such as "foot".
-        seldom: Contacts, as in `contacts`, that are computed only while they are near the ground, which saves time.
         self_collisions: Links that push each other apart: "listed" for the pairs of the robot's file, "all" for links
             that are not adjacent and do not overlap in the standing pose, or pairs of names.
         normal_law: Normal force of contacts: "kelvin_voigt" or "hunt_crossley"; None for the law of the material.
@@ -52,7 +51,6 @@ class SceneOptions(Options):
     """
 
     contacts: str | tuple[str, ...] = option(names, "all")
-    seldom: str | tuple[str, ...] = option(names, ())
     self_collisions: str | tuple[tuple[str, ...], ...] = option(pairs_of_names, ())
     normal_law: str | None = option(optional(one_of(NORMAL_LAWS)), None)
     friction: str = option(one_of(FRICTION), "tangent")
@@ -93,7 +91,6 @@ class StepOptions(SceneOptions):
     Attributes:
         dt: Length of the step [s], a constant of the traced step; None makes it an input, as in kernels.
         contacts: Names of contact spheres.
-        seldom: Names of contact spheres, see `stepping/broad_phase.py`.
         self_collisions: Pairs of names of links.
         control: Meaning of targets, see `ce_gym.Simulator`.
         joint_control: Joints whose targets are velocities or torques although `control` is "position", by name.
@@ -106,7 +103,6 @@ class StepOptions(SceneOptions):
     dt: float | None = None  # type: ignore[assignment]
     _: KW_ONLY
     contacts: tuple[str, ...] = ()
-    seldom: tuple[str, ...] = ()
     self_collisions: tuple[tuple[str, str], ...] = ()
     control: Control = "position"
     joint_control: tuple[tuple[str, JointControl], ...] = ()
@@ -139,7 +135,7 @@ class Scene:
         region_points: Where on their bodies the regions of hulls touch the ground [m], shape (3, n_regions).
         looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_touches);
             empty if that is where they are.
-        choosing: Whether contacts that are seldom near are skipped where none is near; else all contacts always act.
+        culls: Whether contacts of a culled group act only while one of them is near; else all contacts always act.
     """
 
     mechanism: Mechanism
@@ -148,7 +144,7 @@ class Scene:
     ground: SX
     region_points: SX = field(default_factory=lambda: SX(3, 0))
     looked_up: SX = field(default_factory=SX)
-    choosing: bool = False
+    culls: bool = False
 
 
 def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:

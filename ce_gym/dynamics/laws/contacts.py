@@ -21,7 +21,12 @@ from ce_gym.dynamics.parameters import Parameter
 from ce_gym.dynamics.recursion.ce_aba import BodyTerms
 from ce_gym.dynamics.recursion.kinematics import constant
 from ce_gym.dynamics.state import Field, Output, State
+from ce_gym.model.description import Robot
 
+FOOT = "foot"
+"""Group of the contacts that are always computed."""
+MOST = 3
+"""Most groups of contacts that are skipped each by itself; kernels branch for each."""
 TWO_LOADS = ("extrapolated", "adaptive")
 """Methods that remember the normal forces of whole steps apart from those of half steps, see `methods.py`."""
 
@@ -53,14 +58,17 @@ class Contacts(ForceLaw):
         )
         self.output_sizes = {"contact_forces": 3 * len(options.contacts)}
         self.size, self.iterations = Contact.size * n, FRICTION[options.friction].iterations + RELEASES
-        seldom = [i for i, name in enumerate(options.touches) if name in options.seldom]
-        self.culled_rows = [Contact.size * i + j for i in seldom for j in range(Contact.size)]
+        self.groups = culled_groups(self.mechanism.robot, options.touches)
+        self.culled_rows = {
+            group: [Contact.size * i + j for i in places for j in range(Contact.size)]
+            for group, places in self.groups.items()
+        }
 
     def place(self, start: Start) -> PlacedContacts:
         """Place every contact against the ground."""
         contacts = contacts_at(start)
-        named = zip(self.options.touches, contacts, strict=True)
-        return PlacedContacts(start, contacts, [contact for name, contact in named if name in self.options.seldom])
+        culled = {group: [contacts[i] for i in places] for group, places in self.groups.items()}
+        return PlacedContacts(start, contacts, culled)
 
     def energy(self, start: Start) -> SX:
         """Return the energy of the contacts' springs and bristles [J]."""
@@ -73,7 +81,7 @@ class PlacedContacts(PlacedForce):
 
     start: Start
     contacts: list[Contact]
-    culled: list[Contact] = field()  # without the default of the base class
+    culled: dict[str, list[Contact]] = field()  # without the default of the base class
 
     def linearise(self, iterate: SX) -> ContactForces:
         """Linearise every contact about its part of the iterate."""
@@ -127,6 +135,17 @@ class ContactForces(LinearForce):
         return self.start.kinematics.bodies[contact.body].R
 
 
+def culled_groups(robot: Robot, touches: Sequence[str]) -> dict[str, list[int]]:
+    """Return the places of the contacts in each culled group: all but feet, the last group with those beyond `MOST`."""
+    labels = {contact.name: contact.group for contact in robot.contacts}
+    names = list(dict.fromkeys(labels[name] for name in touches if labels[name] != FOOT))
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(touches):
+        if labels[name] != FOOT:
+            groups.setdefault(names[min(names.index(labels[name]), MOST - 1)], []).append(i)
+    return groups
+
+
 def compliance_of(scene: Scene) -> Compliance:
     """Return the compliance of the contacts of a scene."""
     values, material = scene.values, scene.options.material
@@ -160,7 +179,7 @@ def with_contacts(
 ) -> dict[str, BodyTerms]:
     """Return the terms of bodies with contacts added, given the acceleration of free fall in the axes of each body."""
     terms = dict(bodies)
-    for contact in contacts:
+    for contact in sorted(contacts, key=lambda contact: contact.law.near is None):  # sums of culled groups stand alone
         new, old = contact.body_terms(gravity[contact.body]), terms.get(contact.body)
         total, near = BodyTerms(old.inertia + new.inertia, old.force + new.force) if old else new, contact.law.near
         none = old or BodyTerms(SX(6, 6), SX(6, 1))
@@ -170,7 +189,11 @@ def with_contacts(
 
 def any_changed(contacts: Sequence[LinearContact], motion: Motion) -> SX:
     """Return 1 if the active set of a contact differs from the assumed one, else 0."""
-    return ca.sum1(ca.vertcat(*[contact.check(motion) for contact in contacts])) > 0
+    groups: dict[int, list[LinearContact]] = {}
+    for contact in contacts:
+        groups.setdefault(id(contact.law.near), []).append(contact)
+    counts = [where(same[0].law.near, sum((c.check(motion) for c in same), SX(0))) for same in groups.values()]
+    return sum(counts, SX(0)) > 0
 
 
 def iterates_after(contacts: Sequence[LinearContact], iterates: list[SX], motion: Motion, unconverged: SX) -> SX:

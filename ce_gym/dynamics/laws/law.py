@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar
 
 from ce_gym.dynamics.algebra.spatial import SX
@@ -129,10 +130,10 @@ class PlacedForce:
     """A force law at the start of a step.
 
     Attributes:
-        culled: Contacts that are seldom near; they act only if one of them is in range.
+        culled: Contacts by culled group, see `stepping/broad_phase.py`.
     """
 
-    culled: Sequence[Contact] = ()
+    culled: Mapping[str, Sequence[Contact]] = MappingProxyType({})
 
     def linearise(self, iterate: SX) -> LinearForce:
         """Linearise about an iterate, shape (size,)."""
@@ -175,7 +176,7 @@ class ForceLaw:
         output_sizes: Sizes of the outputs by name.
         size: Size of the iterate; all zero at first.
         iterations: Number of further iterations of a step that the law may need.
-        culled_rows: Rows of the iterate of contacts that are seldom near.
+        culled_rows: Rows of the iterate by culled group, see `stepping/broad_phase.py`.
     """
 
     mechanism: Mechanism
@@ -185,7 +186,7 @@ class ForceLaw:
     output_sizes: Mapping[str, int] = field(default_factory=dict)
     size: int = 0
     iterations: int = 0
-    culled_rows: Sequence[int] = ()
+    culled_rows: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
     parameters: ClassVar[tuple[Parameter, ...]] = ()
     """Parameters of the law; their values are in `Scene.values`."""

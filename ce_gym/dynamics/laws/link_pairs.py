@@ -17,6 +17,9 @@ from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, 
 from ce_gym.dynamics.state import Field
 from ce_gym.model.checks.collisions import colliding
 
+LINKS = "links"
+"""Name of the culled group of all pairs."""
+
 
 class LinkPairs(ForceLaw):
     """Pairs of capsules on links that push each other apart."""
@@ -29,12 +32,12 @@ class LinkPairs(ForceLaw):
         meaning = "force between each pair of capsules over the last step"
         self.fields = (Field("pair_force", n, "N", meaning, explicit=True),)
         self.size, self.iterations = Contact.size * n, Frictionless.iterations
-        self.culled_rows = range(self.size)
+        self.culled_rows = {LINKS: range(self.size)} if n else {}
 
     def place(self, start: Start) -> PlacedPairs:
         """Place the capsules of every pair against each other."""
         pairs = self._pairs_at(start)
-        return PlacedPairs(pairs, pairs)
+        return PlacedPairs(pairs, {LINKS: pairs})
 
     def energy(self, start: Start) -> SX:
         """Return the energy of the springs between links [J]."""
@@ -55,7 +58,7 @@ class PlacedPairs(PlacedForce):
     """The pairs at the start of a step."""
 
     pairs: list[Pair]
-    culled: list[Pair] = field()  # without the default of the base class
+    culled: dict[str, list[Pair]] = field()  # without the default of the base class
 
     def linearise(self, iterate: SX) -> PairForces:
         """Linearise every pair about its part of the iterate."""

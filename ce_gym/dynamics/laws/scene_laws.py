@@ -97,10 +97,10 @@ def iterations_needed(mechanism: Mechanism, options: StepOptions) -> int:
     return max((law.iterations for law in scene_laws(mechanism, options)), default=0)
 
 
-def culled_rows(mechanism: Mechanism, options: StepOptions) -> list[int]:
-    """Return the rows of the iterate of contacts that act only where some contact is near."""
-    rows, first = [], 0
+def culled_rows(mechanism: Mechanism, options: StepOptions) -> list[list[int]]:
+    """Return the rows of the iterate of each culled group, in the order of `step.cull`."""
+    groups, first = [], 0
     for law in scene_laws(mechanism, options):
-        rows += [first + row for row in law.culled_rows]
+        groups += [[first + row for row in rows] for rows in law.culled_rows.values()]
         first += law.size
-    return rows
+    return groups

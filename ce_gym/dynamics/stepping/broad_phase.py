@@ -1,9 +1,10 @@
-"""Broad phase: pairs of links, and contacts declared as `seldom`, are evaluated only where they may touch in a step.
+"""Broad phase: pairs of links, and contacts other than feet, are evaluated only where they may touch in a step.
 
-Whether anything of a robot is in range follows from the robot's own state alone. Tiles in which no robot has anything
-in range evaluate a reduced step function with the same bits, so results do not depend on neighbours. Two bodies are in
-range if their distance is below `MARGIN`, or will be within `STEPS` steps at their present approach velocity. A body
-that an impact accelerates further than that within the step begins to act in the next step.
+Culled groups are the groups of contacts except feet, and all pairs of links. Whether a group of a robot is in range
+follows from the robot's own state alone. Tiles in which no robot has a group in range skip the group with the same
+bits, so results do not depend on neighbours. Two bodies are in range if their distance is below `MARGIN`, or will be
+within `STEPS` steps at their present approach velocity. A body that an impact accelerates further than that within the
+step begins to act in the next step.
 """
 
 from __future__ import annotations
@@ -14,17 +15,11 @@ import casadi as ca
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.forces.contact import Touch
-from ce_gym.dynamics.forces.scene import StepOptions
 
 MARGIN = 0.01
 """Bodies that are closer are in range [m]."""
 STEPS = 2.0
 """Bodies that come closer than `MARGIN` within this many steps are in range, too."""
-
-
-def has_broad_phase(options: StepOptions) -> bool:
-    """Return whether a scene has contacts or pairs that are evaluated only in range."""
-    return bool(options.seldom or options.self_collisions)
 
 
 def any_in_range(touches: Sequence[Touch], dt: float) -> SX:

@@ -60,7 +60,7 @@ class System:
         laws: The force laws of the scene.
         forces: The force of each law for the assumed active set.
         loads: Their sums on joints and bodies.
-        near: 1 if a contact that is seldom near is in range, else 0; None if all contacts always act.
+        near: For each culled group 1 if one of its contacts is in range, else 0; empty if all contacts always act.
         pushed: Whether a law other than contacts acts on bodies.
     """
 
@@ -68,7 +68,7 @@ class System:
     laws: Sequence[ForceLaw]
     forces: Sequence[LinearForce]
     loads: Loads
-    near: SX | None
+    near: Sequence[SX]
     pushed: bool
 
     @property
@@ -170,7 +170,7 @@ def linearise(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
     """
     start, laws = Start(scene, state, target, dt), scene_laws(scene.mechanism, scene.options)
     placed = [law.place(start) for law in laws]
-    near = cull(placed, dt) if scene.choosing else None
+    near = cull(placed, dt) if scene.culls else []
     parts = split(iterate, [law.size for law in laws])
     forces = [force.linearise(part) for force, part in zip(placed, parts, strict=True)]
     loads = first_loads(start)
@@ -182,12 +182,13 @@ def linearise(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
     return System(start, laws, forces, loads, near, pushed)
 
 
-def cull(placed: Sequence[PlacedForce], dt: float) -> SX:
-    """Let contacts that are seldom near act only if one of them is in range, in place; return 1 if one is, else 0."""
-    seldom = [contact for force in placed for contact in force.culled]
-    near = any_in_range([contact.touch for contact in seldom], dt)
-    for contact in seldom:
-        contact.near = near
+def cull(placed: Sequence[PlacedForce], dt: float) -> list[SX]:
+    """Let each culled group act only if one of its contacts is in range, in place; return 1 or 0 for each group."""
+    groups = [contacts for force in placed for contacts in force.culled.values()]
+    near = [any_in_range([contact.touch for contact in contacts], dt) for contacts in groups]
+    for contacts, flag in zip(groups, near, strict=True):
+        for contact in contacts:
+            contact.near = flag
     return near
 
 

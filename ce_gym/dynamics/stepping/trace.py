@@ -32,8 +32,8 @@ SINGULAR = 1e-3
 """A robot whose loops are nearer than this to a singularity (see `Model.nearness`) has diverged."""
 SANE_SPEED = 1e4
 """A robot any of whose velocities is beyond this, or NaN, has diverged [rad/s or m/s]."""
-NEAR = "near"
-"""Name of the buffer that says whether something is that is seldom near."""
+NEAR, NEAR_ITERATE = "near_", "near_iterate_"
+"""Begin the names of the flag of each culled group, and of its part of the iterate; the number of the group follows."""
 SANE_DISTANCE = 1e6
 """A robot any of whose positions is beyond this, or NaN, has diverged [rad or m]."""
 
@@ -66,7 +66,7 @@ def iteration_function(
     options: StepOptions,
     outputs: tuple[str, ...] = (),
     follows: bool = False,
-    chooses: bool = False,
+    culls: bool = False,
     conserves: bool = True,
 ) -> ca.Function:
     """Trace one iteration of an Euler step: repeated on its own iterate until it has converged, it makes the step.
@@ -76,8 +76,8 @@ def iteration_function(
         options: The scene.
         outputs: See `step_function`.
         follows: See `step_function`.
-        chooses: Whether contacts that are seldom near are left out where none is in range. The output `NEAR` is then 1
-            if one is in range, else 0, and `near_iterate` holds the part of the iterate of these contacts.
+        culls: Whether each culled group is left out where none of its contacts is in range. The output `NEAR` of the
+            group is then 1 if one is in range, else 0, and `NEAR_ITERATE` holds the group's part of the iterate.
         conserves: Whether the velocities have their momentum and energy; if not, the output `BALANCE` is for
             `conserve_function`.
 
@@ -86,13 +86,14 @@ def iteration_function(
         `step_function`; the iterate is zero at first, shape (iterate_size,).
     """
     given, size = Given(mechanism, options, follows), iterate_size(mechanism, options)
-    rows = {"near_iterate": culled_rows(mechanism, options)} if chooses else {}
-    always = [i for i in range(size) if i not in rows.get("near_iterate", ())]
-    rows |= {"iterate": always} if always or not chooses else {}
+    groups = culled_rows(mechanism, options) if culls else []
+    rows = {f"{NEAR_ITERATE}{i}": group for i, group in enumerate(groups)}
+    always = sorted({*range(size)}.difference(*groups))
+    rows |= {"iterate": always} if always or not culls else {}
     parts, iterate = {name: SX.sym(name, len(of)) for name, of in rows.items()}, SX(size, 1)
     for name, part in parts.items():
         iterate[rows[name]] = part
-    given.scene = replace(given.scene, choosing=chooses)
+    given.scene = replace(given.scene, culls=culls)
     symbol = SX.sym(BALANCE, 0 if conserves else balance_size(mechanism))
     balance = None if conserves else Balance.from_column(symbol)
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate, balance)
@@ -105,7 +106,7 @@ def iteration_function(
         told[BALANCE] = stepped.balance.column
         parts[BALANCE] = symbol
     left = {f"{name}_next": stepped.iterate[of] for name, of in rows.items()} | {"unconverged": stepped.unconverged}
-    left |= {} if stepped.solved.system.near is None else {NEAR: stepped.solved.system.near}
+    left |= {f"{NEAR}{i}": near for i, near in enumerate(stepped.solved.system.near)}
     return traced("iteration", given.inputs() | parts, given.guarded(stepped) | left | told)
 
 
