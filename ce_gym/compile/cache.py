@@ -20,6 +20,8 @@ from ce_gym.compile.system import user_number
 
 FOLDER_VARIABLE = "CE_GYM_CACHE_DIR"
 DIGEST_BYTES = 32
+LONG = 5.0
+"""Compile time from which an estimate is printed [s]."""
 
 
 def cache_folder() -> Path | None:
@@ -110,16 +112,18 @@ def _tell_once(text: str) -> None:
 
 
 @contextmanager
-def announced(what: str, folder: Path | None, started: float) -> Iterator[None]:
-    """Print that a kernel is being compiled and, in the end, how long that took.
+def announced(what: str, folder: Path | None, started: float, expected: float = 0.0) -> Iterator[None]:
+    """Print that a kernel is being compiled, an estimate if that is long, and, in the end, how long that took.
 
     Args:
         what: name of the kernel.
         folder: of `cache_folder`.
         started: start of the measured time [s], of `time.perf_counter`.
+        expected: estimate of that time on an idle machine [s]; 0 if unknown.
     """
     kept = "not kept" if folder is None else f"once; cached in {folder}"
-    print(f"ce_gym: compiling {what}, {kept} ...", end="", file=sys.stderr, flush=True)
+    estimate = f", about {expected:.0f} s" if expected > LONG else ""
+    print(f"ce_gym: compiling {what}, {kept}{estimate} ...", end="", file=sys.stderr, flush=True)
     try:
         yield
     finally:

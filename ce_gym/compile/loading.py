@@ -18,7 +18,7 @@ from ce_gym.compile.arrays import lane_count
 from ce_gym.compile.cache import announced, cache_folder, read_or_make
 from ce_gym.compile.kernel import Kernel
 from ce_gym.compile.layout import layout_from, layout_of
-from ce_gym.compile.program import Program, check_program
+from ce_gym.compile.program import Call, Program, check_program
 from ce_gym.compile.sources import source_fingerprint, toolchain
 from ce_gym.compile.system import at_fork
 
@@ -26,6 +26,9 @@ SOURCES = tuple(
     f"ce_gym.compile.{name}" for name in ("arrays", "layout", "loading", "lowering", "machine_code", "program")
 )
 """Modules that turn programs into entries of the cache."""
+
+SECONDS = 2.5e-4
+"""Time to compile an instruction of CasADi on a core of 2024 [s], for estimates."""
 
 _loaded: dict[tuple[Path | None, str], Kernel] = {}
 _lock = threading.RLock()
@@ -89,7 +92,9 @@ def _compile(build: Callable[[], Program], dtype: str, folder: Path | None) -> t
     program = build()
     check_program(program)
     layout = layout_of(program, dtype)
-    with announced(f"{program.name} ({dtype})", folder, started):
+    functions = {call.function for call in program.calls if isinstance(call, Call)}
+    expected = SECONDS * sum(function.n_instructions() for function in functions)
+    with announced(f"{program.name} ({dtype})", folder, started, expected):
         parts = registers_per_vector() if program.compact else 1
         code = compile_object(
             lambda builder, arguments: emit_tile(builder, program, layout, arguments, parts), not program.compact

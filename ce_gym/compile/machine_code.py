@@ -19,6 +19,8 @@ number of environments."""
 ENTRY = "run"
 OPTIMISATION = 3
 """Optimisation level of the passes of LLVM."""
+LONG = 8_000_000
+"""Characters of code in the language of LLVM above which most passes are left out, to save a fifth of the time."""
 GENERATION = 1
 """Optimisation level of code generation. At higher levels, LLVM reorders instructions again during register allocation
 on some CPUs, which doubles the compile time and makes no kernel faster."""
@@ -42,19 +44,20 @@ def compile_object(emit: Emit, thorough: bool = True) -> bytes:
 
     Args:
         emit: emits the body of the loop.
-        thorough: whether to run all passes of LLVM, or only instruction combining. In long functions without branches
-            the other passes find little and take as long as register allocation.
+        thorough: whether to run all passes of LLVM, unless the code is `LONG`, or only instruction combining. In long
+            functions without branches the other passes find little and take as long as register allocation.
 
     Returns:
         An object file that defines the one function `run`.
     """
     machine = _target_machine()
-    module = binding.parse_assembly(str(_loop_over_tiles(emit)))
+    text = str(_loop_over_tiles(emit))
+    module = binding.parse_assembly(text)
     module.verify()
     tuning = binding.create_pipeline_tuning_options(speed_level=OPTIMISATION)
     tuning.loop_vectorization = tuning.slp_vectorization = False  # the code is made of vectors already
     passes = binding.create_pass_builder(machine, tuning)
-    if thorough:
+    if thorough and len(text) < LONG:
         passes.getModulePassManager().run(module, passes)
     else:
         _simplify(module, passes)

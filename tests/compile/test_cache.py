@@ -73,6 +73,13 @@ def original(tmp_path_factory):
     return folder, computed
 
 
+@pytest.mark.parametrize(("expected", "said"), [(12.4, "not kept, about 12 s ... "), (3.0, "not kept ... ")])
+def test_an_estimate_is_printed_if_it_is_long(expected, said, capsys):
+    with cache.announced("a thing", None, 0.0, expected):
+        pass
+    assert capsys.readouterr().err.startswith(f"ce_gym: compiling a thing, {said}")
+
+
 @pytest.fixture(autouse=True)
 def forget(monkeypatch):
     """No kernel of other tests, and nothing said to the user yet."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ce_gym.compile import Buffer, Call, Program, aligned_zeros, load_kernel
+from ce_gym.compile.lowering import partial_evaluation
 from ce_gym.compile.lowering.function import split_function, variants_of
 from ce_gym.compile.lowering.graph import (
     FMA,
@@ -237,17 +238,19 @@ def total_of(x):
 CROWD = (("x", "y", "z", "held", "kept"), ("value", "z", "held", "kept", "flag", "near", "far"))
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_each_flag_skips_its_operations_alone_to_the_same_bits(dtype):
-    """Tiles in which no robot, some or all robots have neither flag, one or both."""
+@pytest.mark.parametrize(("dtype", "piece"), [("float64", 1000), ("float32", 1000), ("float64", 3)])
+def test_each_flag_skips_its_operations_alone_to_the_same_bits(dtype, piece, monkeypatch):
+    """Tiles in which no robot, some or all robots have neither flag, one or both; also in pieces of few operations."""
     results = []
+    monkeypatch.setattr(partial_evaluation, "LONG", piece)
+    monkeypatch.setattr(partial_evaluation, "PIECE", piece)
     for short in ((), ("near", "far"), ("far", "near")):
         function, iterates = crowding(), ("z", "held", "kept")
         calls = [Call(function, *CROWD, short_if_zero=short)]
         calls += [Call(function, *CROWD, only_if="flag", short_if_zero=short, again=iterates)] * 3
         names = (*CROWD[0], *(name for name in CROWD[1] if name not in CROWD[0]))
         program = Program("crowding", tuple(Buffer(name, 1, "tiles") for name in names), tuple(calls))
-        kernel = load_kernel(f"crowding {short}", lambda program=program: program, dtype)
+        kernel = load_kernel(f"crowding {short} {piece}", lambda program=program: program, dtype)
         n, rng = 8 * kernel.lanes, np.random.default_rng(3)
         arrays = {name: aligned(rng.uniform(0.5, 1, (8, 1, kernel.lanes)).astype(dtype)) for name in names}
         for tile in range(6):
@@ -267,7 +270,7 @@ def test_parts_of_several_flags_are_as_many_as_flags():
     of_flags = [{k for part in parts.parts if part.flag == flag for k in part.fragment.nodes} for flag in (5, 6)]
     assert not of_flags[0] & of_flags[1]
     assert all(of_flags)
-    graph = parts.first.graph
+    graph = parts.first[0].fragment.graph
     assert {graph.ops[k] for k in of_flags[1]} >= {ca.OP_SQRT, ca.OP_COS}
     assert ca.OP_SIN not in {graph.ops[k] for k in of_flags[1]}
     (short,) = [part for part in parts.short if part.fragment.nodes]
@@ -277,13 +280,14 @@ def test_parts_of_several_flags_are_as_many_as_flags():
 def test_what_does_not_depend_on_an_iterate_is_in_the_prologue():
     parts = split_function(growing(), {2})
     (part,) = parts.parts
-    first, second = executed(parts.first), executed(part.fragment)
+    (start,) = parts.first
+    first, second = executed(start.fragment), executed(part.fragment)
     assert not part.constant
     assert {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} <= set(first)
     assert not {ca.OP_SIN, ca.OP_EXP, ca.OP_SQRT} & set(second)
-    before = set(parts.first.nodes)
+    before = set(start.fragment.nodes)
     read = {a for k in part.fragment.nodes for a in part.fragment.graph.operands[k]}
-    assert set(parts.first.keeps.values()) == read & before != set()
+    assert set(start.fragment.keeps.values()) == read & before != set()
     needed = graph_of(growing()).ancestors([k for k, op in enumerate(part.fragment.graph.ops) if op == ca.OP_OUTPUT])
     assert before | {*part.fragment.nodes} == {k for k in needed if graph_of(growing()).ops[k] not in NO_OPERATION}
 
@@ -292,8 +296,8 @@ def test_what_only_a_flag_needs_is_in_a_variant():
     """The root is executed with the flag only, cheap values are recomputed there, and the sine is always needed."""
     flag = LEFT.index("choice")
     parts = split_function(growing(), {2}, [flag])
-    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_LT} <= set(executed(parts.first))
-    assert ca.OP_SQRT not in executed(parts.first)
+    assert {ca.OP_SIN, ca.OP_EXP, ca.OP_LT} <= set(executed(parts.first[0].fragment))
+    assert ca.OP_SQRT not in executed(parts.first[0].fragment)
     constant = [part for part in parts.parts if part.constant]
     assert {ca.OP_SQRT} <= {op for part in constant if part.flag == flag for op in executed(part.fragment)}
     assert ca.OP_EXP in {op for part in constant for op in executed(part.fragment)}
@@ -332,7 +336,7 @@ def test_a_second_iteration_of_a_step_takes_kinematics_from_the_first():
     function = iteration_function(model.mechanism, options, conserves=False)
     parts = split_function(function, {function.name_in().index("iterate")})
     second = [op for part in parts.parts if not part.constant for op in executed(part.fragment)]
-    assert executed(parts.first).count(ca.OP_SIN) == 12
+    assert executed(parts.first[0].fragment).count(ca.OP_SIN) == 12
     assert second.count(ca.OP_SIN) == 1
     assert len(second) < 0.8 * len(operations(graph_of(function)))
 

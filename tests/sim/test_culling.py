@@ -87,7 +87,7 @@ def test_feet_are_in_no_group_and_groups_are_few():
         i for i, contact in enumerate(robot.contacts) if contact.group != "foot"
     }
     labels = ["foot", "a", "b", "c", "d", "e", "a"]
-    renamed = [ContactSphere(f"s{i}", "base", (0.0,) * 3, 0.0, label) for i, label in enumerate(labels)]
+    renamed = [ContactSphere(f"s{i}", "base", (0.0, 0.0, 0.0), 0.0, label) for i, label in enumerate(labels)]
     robot = Robot(robot.name, robot.bodies, contacts=tuple(renamed))
     groups = culled_groups(robot, [contact.name for contact in renamed])
     assert len(groups) == MOST

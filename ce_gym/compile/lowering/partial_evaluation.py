@@ -22,6 +22,8 @@ from ce_gym.compile.lowering.ordering import ordered
 Nodes: TypeAlias = Collection[int]
 CHEAP = 32
 """Most operations to recompute a value that only tiles with a flag need, so that other tiles do not store the value."""
+LONG, PIECE = 12_000, 4_000
+"""Operations of a part that is divided into several functions, and of these. Parts of usual robots are shorter."""
 NONE: Mapping[int, Nodes] = {}
 NO_ZEROS: Mapping[int, bool] = {}
 Owners: TypeAlias = dict[int, tuple[int, int | None]]
@@ -76,13 +78,13 @@ class Split:
     """A function in parts.
 
     Attributes:
-        first: Constant operations of all tiles, which compute the flags; skipped in a repeated call.
+        first: Constant parts of all tiles, which compute the flags; skipped in a repeated call.
         parts: Parts of tiles where a flag is not zero in some lane, in the order of execution.
         short: Parts of all other tiles.
         size: Number of values that fragments keep for each other.
     """
 
-    first: Fragment
+    first: tuple[Part, ...]
     parts: tuple[Part, ...]
     short: tuple[Part, ...]
     size: int
@@ -115,28 +117,28 @@ def split(
         ValueError: If a flag may change in a repeated call.
     """
     flag_nodes = [_value(graph, outputs[flag]) for flag in flags]
-    users, needed = graph.users(), graph.ancestors([k for nodes in outputs for k in nodes])
+    users = graph.users()
     changes, choices = reached(changing, users), reached(flag_nodes, users).difference(flag_nodes)
     for flag, node in zip(flags, flag_nodes, strict=True):
         if node in changes:
             raise ValueError(f"output {flag} is a choice; expected one that does not follow from what changes")
-    short, before = specialize(graph, set(flag_nodes))[0], graph.ancestors(flag_nodes)
-    order = [k for k in ordered(graph) if k in needed]
+    order = _alive(graph, ordered(graph), [k for nodes in outputs for k in nodes])
+    short, before = specialize(graph, order, set(flag_nodes))[0], graph.ancestors(flag_nodes)
     always = {k for k in order if k not in choices and short.ops[k] != REMOVED} | before
     once = [k for k in order if k in always and k not in changes]
     others = [k for number, nodes in enumerate(outputs) for k in nodes if number not in flags]
-    of_short = _Path(short, set(once), _alive(short, others), changes, {}, overlaps, others, zeros)
+    of_short = _Path(short, set(once), _alive(short, order, others), changes, {}, overlaps, others, zeros)
     path = of_short
     if flags:
         again = _recomputed(graph, order, set(once), of_short.given | {*flag_nodes})
         owners = _owners(graph, order, flag_nodes)
         path = _Path(graph, set(once) - again, order, changes, owners, overlaps, others, zeros)
-    given = sorted(of_short.given | path.given)
-    slots = {k: slot for slot, k in enumerate(given)}
-    written = _written(graph, [k for flag in flags for k in outputs[flag]])
-    first = Fragment(graph, ordered(graph, once, list(written)), written, {slots[k]: k for k in given})
-    (parts, size), (of_others, other_size) = (each.finished(slots, flags) for each in (path, of_short))
-    return Split(first, parts, of_others, max(size, other_size))
+    of_flags = [k for flag in flags for k in outputs[flag]]
+    first = _Path(graph, (), once, changes, {}, NONE, of_flags, NO_ZEROS, of_short.given | path.given)
+    ended, slots, size = first.finished({}, 0, ())
+    parts, _, of_parts = path.finished(slots, size, flags)
+    of_others, _, of_short_parts = of_short.finished(slots, size, flags)
+    return Split(ended, parts, of_others, max(of_parts, of_short_parts))
 
 
 def variants(graph: Graph, outputs: Sequence[Nodes], flags: Sequence[int]) -> tuple[Fragment, Fragment, Fragment]:
@@ -152,7 +154,7 @@ def variants(graph: Graph, outputs: Sequence[Nodes], flags: Sequence[int]) -> tu
         _written(graph, [k for flag in flags for k in outputs[flag]]),
         zeros=frozenset(flags),
     )
-    short, others = specialize(graph, set(flag_nodes))[0], numbers - frozenset(flags)
+    short, others = specialize(graph, ordered(graph), set(flag_nodes))[0], numbers - frozenset(flags)
     written = _written(short, [k for number in others for k in outputs[number]])
     return of_flags, whole(graph, len(outputs)), Fragment(short, ordered(short), written, zeros=others)
 
@@ -163,11 +165,16 @@ def whole(graph: Graph, n_outputs: int) -> Fragment:
     return Fragment(graph, ordered(graph), written, zeros=frozenset(range(n_outputs)))
 
 
-def specialize(graph: Graph, zeros: set[int]) -> tuple[Graph, dict[int, int]]:
+def specialize(graph: Graph, order: Sequence[int], zeros: set[int]) -> tuple[Graph, dict[int, int]]:
     """Return a graph in which some nodes are known to be zero, and the nodes that replace others there.
 
     The graph has no operations that no output needs. A node that replaces another one is an operand that is chosen, or
     a constant.
+
+    Args:
+        graph: The function.
+        order: Its operations, operands first.
+        zeros: The known nodes.
     """
     result = Graph(list(graph.ops), list(graph.operands), dict(graph.constants))
     known: dict[int, float] = dict.fromkeys(zeros, 0.0)
@@ -184,7 +191,7 @@ def specialize(graph: Graph, zeros: set[int]) -> tuple[Graph, dict[int, int]]:
         return k
 
     outputs = [k for k, op in enumerate(graph.ops) if op == casadi.OP_OUTPUT]
-    for k in (*ordered(graph), *outputs):
+    for k in (*order, *outputs):
         operands = graph.operands[k]
         value, chosen = _choice(graph.ops[k], operands, [known.get(replacements.get(a, a)) for a in operands])
         if value is not None:
@@ -227,7 +234,7 @@ def _owners(graph: Graph, order: Sequence[int], flags: Sequence[int]) -> Owners:
     """
     before, result = graph.ancestors(flags), {}
     for i, flag in enumerate(flags):
-        n, (short, replacements) = len(graph.ops), specialize(graph, {flag})
+        n, (short, replacements) = len(graph.ops), specialize(graph, order, {flag})
         for k in order:
             if k in before or k in result or short.ops[k] != REMOVED:
                 continue
@@ -239,10 +246,18 @@ def _owners(graph: Graph, order: Sequence[int], flags: Sequence[int]) -> Owners:
     return result
 
 
-def _alive(graph: Graph, outputs: Nodes) -> list[int]:
-    """Return the operations that outputs need, operands first."""
+def _pieces(graph: Graph, nodes: list[int]) -> list[list[int]]:
+    """Return operations in pieces: LLVM takes a time that grows with the square of a long function's length."""
+    if len(nodes) <= LONG:
+        return [nodes]
+    order = ordered(graph, nodes, ())
+    return [order[i : i + PIECE] for i in range(0, len(order), PIECE)]
+
+
+def _alive(graph: Graph, order: Sequence[int], outputs: Nodes) -> list[int]:
+    """Return those of some operations that outputs need."""
     needed = graph.ancestors(outputs)
-    return [k for k in ordered(graph) if k in needed]
+    return [k for k in order if k in needed]
 
 
 def _recomputed(graph: Graph, order: Sequence[int], once: set[int], kept: set[int]) -> set[int]:
@@ -308,6 +323,7 @@ class _Path:
         overlaps: See `split`.
         outputs: Output nodes.
         zeros: See `split`.
+        kept: Operations of the path that are read after it.
 
     Attributes:
         given: Operations that have been executed and are read.
@@ -323,14 +339,16 @@ class _Path:
         overlaps: Mapping[int, Nodes],
         outputs: Nodes,
         zeros: Mapping[int, bool],
+        kept: Nodes = (),
     ) -> None:
         self.graph, self.owners, self.overlaps = graph, owners, overlaps
         keys = _keys(graph, [k for k in order if k not in once], changes, owners)
         groups: dict[Key, list[int]] = defaultdict(list)
         for k, key in keys.items():
             groups[key].append(k)
-        self.keys = sorted(groups)
-        self.nodes = [groups[key] for key in self.keys]
+        pieces = [(key, piece) for key in sorted(groups) for piece in _pieces(graph, groups[key])]
+        self.keys = [key for key, _ in pieces]
+        self.nodes = [piece for _, piece in pieces]
         self.part_of = {k: i for i, nodes in enumerate(self.nodes) for k in nodes}
         self.last_read = {a: i for i, nodes in enumerate(self.nodes) for k in nodes for a in _read(graph, k, owners)}
         self.stores: list[dict[int, int]] = [{} for _ in self.keys]
@@ -340,7 +358,7 @@ class _Path:
             self._add_output(node)
         for number, shared in zeros.items():
             self.zeros[self._part(len(self.keys) - 1 if shared else 0, 0)].add(number)
-        self.kept = self._read_later()
+        self.kept = self._read_later(kept)
         self.given = {k for k in self.kept if k not in self.part_of}
 
     def _add_output(self, node: int) -> None:
@@ -370,9 +388,9 @@ class _Path:
         self.zeros.append(set())
         return len(self.keys) - 1
 
-    def _read_later(self) -> dict[int, int]:
-        """Return the operations that are read in another part than theirs, and the last such part."""
-        kept: dict[int, int] = {}
+    def _read_later(self, after: Nodes) -> dict[int, int]:
+        """Return the operations that are read in another part than theirs, or `after` all, and the last such part."""
+        kept = dict.fromkeys(after, len(self.keys))
         for i in reversed(range(len(self.keys))):
             values = {a for k in self.nodes[i] for a in self.graph.operands[k]}
             values.update(self.stores[i].values(), self.skipped[i].values())
@@ -385,9 +403,11 @@ class _Path:
     def _copy(self, k: int) -> int | None:
         return self.owners[k][1] if k in self.owners else None
 
-    def finished(self, given: Mapping[int, int], flags: Sequence[int]) -> tuple[tuple[Part, ...], int]:
-        """Return the parts and the number of slots, given the slots of operations that have been executed."""
-        slots, parts, size = dict(given), [], len(given)
+    def finished(
+        self, given: Mapping[int, int], size: int, flags: Sequence[int]
+    ) -> tuple[tuple[Part, ...], dict[int, int], int]:
+        """Return the parts, and all slots and their number, given those of operations that have been executed."""
+        slots, parts = dict(given), []
         free: list[int] = []
         for i, (nodes, (changing, _, group)) in enumerate(zip(self.nodes, self.keys, strict=True)):
             if changing:  # constants are read again in a repeated call
@@ -403,7 +423,7 @@ class _Path:
             fragment = Fragment(self.graph, order, self.stores[i], keeps, slots, frozenset(self.zeros[i]))
             skipped = Fragment(self.graph, (), self.skipped[i], copies, slots)
             parts.append(Part(fragment, not changing, flags[group - 1] if group else None, skipped))
-        return tuple(parts), size
+        return tuple(parts), slots, size
 
 
 def _value(graph: Graph, outputs: Nodes) -> int:

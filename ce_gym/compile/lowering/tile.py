@@ -249,7 +249,7 @@ class _TileWork:
             self._call_body(call)
             return
         if not call.again:
-            self._call_fragments(call, split, [split.first])
+            self._call_parts(call, split, split.first)
         if not call.short_if_zero:
             self._call_parts(call, split, split.parts)
             return
