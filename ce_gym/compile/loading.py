@@ -27,7 +27,7 @@ SOURCES = tuple(
 )
 """Modules that turn programs into entries of the cache."""
 
-SECONDS = 2.5e-4
+SECONDS = 1.5e-4
 """Time to compile an instruction of CasADi on a core of 2024 [s], for estimates."""
 
 _loaded: dict[tuple[Path | None, str], Kernel] = {}

@@ -69,7 +69,7 @@ def test_culled_contacts_act_as_those_that_are_always_computed(monkeypatch):
     """Robots fall on knees and trunk as in a scene without culling, until rounding errors have grown."""
     make = partial(Simulator, Model("mini_cheetah"), NUM_ENVS, outputs=("contact_forces",))
     culled = falls(make())
-    in_place_of(monkeypatch, "iteration_function", lambda *given, culls: iteration_function(*given))
+    in_place_of(monkeypatch, "iteration_function", lambda *given, culls, **more: iteration_function(*given, **more))
     always = falls(make())
     for step in range(30):
         np.testing.assert_allclose(culled[step][0], always[step][0], atol=1e-7)

@@ -64,7 +64,7 @@ class Part:
         fragment: The operations.
         constant: Whether they depend on no changing input.
         flag: Number of the output that tells where the operations matter; None if they always do.
-        skipped: What is executed instead in tiles where the flag is zero in all lanes.
+        skipped: Copies and stores that replace the fragment in tiles where the flag is zero in all lanes.
     """
 
     fragment: Fragment
@@ -255,7 +255,7 @@ def _pieces(graph: Graph, nodes: list[int]) -> list[list[int]]:
 
 
 def _alive(graph: Graph, order: Sequence[int], outputs: Nodes) -> list[int]:
-    """Return those of some operations that outputs need."""
+    """Return the operations that outputs need, in the given order."""
     needed = graph.ancestors(outputs)
     return [k for k in order if k in needed]
 
@@ -306,7 +306,7 @@ def _steps(before: int, after: int) -> int:
 
 
 def _read(graph: Graph, k: int, owners: Owners) -> tuple[int, ...]:
-    """Return the nodes that must be known before an operation, or what is copied in its place."""
+    """Return the nodes that must be known before an operation or the copy in its place."""
     copy = owners[k][1] if k in owners else None
     return graph.operands[k] if copy is None else (*graph.operands[k], copy)
 
@@ -377,7 +377,7 @@ class _Path:
         self.last_read[value] = max(place, self.last_read.get(value, 0))
 
     def _part(self, earliest: int, group: int) -> int:
-        """Return the first part of a group that is not earlier than another part; a new one if there is none."""
+        """Return the first part of a group from a place on; add a part if the group has no such part."""
         for i in range(max(earliest, 0), len(self.keys)):
             if self.keys[i][2] == group:
                 return i
@@ -406,7 +406,7 @@ class _Path:
     def finished(
         self, given: Mapping[int, int], size: int, flags: Sequence[int]
     ) -> tuple[tuple[Part, ...], dict[int, int], int]:
-        """Return the parts, and all slots and their number, given those of operations that have been executed."""
+        """Return the parts, all slots and their number, given the slots of operations that have been executed."""
         slots, parts = dict(given), []
         free: list[int] = []
         for i, (nodes, (changing, _, group)) in enumerate(zip(self.nodes, self.keys, strict=True)):
