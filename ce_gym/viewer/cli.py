@@ -76,7 +76,7 @@ def add_play_command(subparsers: Any) -> None:
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first robot (default 0)")
     add_env_arguments(parser)
-    parser.add_argument("--out", type=path, metavar="FOLDER", help="also write the rollouts as .npz files there")
+    parser.add_argument("--save", type=path, metavar="FOLDER", help="also write the rollouts as .npz files there")
     _add_page_arguments(parser, "here, named after the policy")
     parser.set_defaults(run=play)
 
@@ -101,7 +101,7 @@ def add_live_command(subparsers: Any) -> None:
     parser.add_argument("--ghost", metavar="LEVEL", default="", help="level of a ghost (default: no ghost)")
     parser.add_argument("--terrain", metavar="KIND", default="", help="first ground (default: as trained)")
     parser.add_argument(
-        "--out", type=path, default=Path(), metavar="FOLDER", help="where recordings are written (default: here)"
+        "--folder", type=path, default=Path(), metavar="FOLDER", help="where recordings are written (default: here)"
     )
     _add_open_argument(parser, default=True)
     parser.set_defaults(run=live)
@@ -193,11 +193,11 @@ def play(args: argparse.Namespace) -> int:
     rollouts = [rollout for level in levels for rollout in walk(file, script, **options, **level)]
     if args.robots > 1:
         rollouts = [replace(rollout, label=f"seed {args.seed + index}") for index, rollout in enumerate(rollouts)]
-    if args.out:
-        args.out.mkdir(parents=True, exist_ok=True)
+    if args.save:
+        args.save.mkdir(parents=True, exist_ok=True)
         for index, rollout in enumerate(rollouts):
             number = f"_{args.seed + index}" if args.robots > 1 else ""
-            print(rollout.save(args.out / f"{policy_name(file)}_{rollout.transmission}{number}.npz"))
+            print(rollout.save(args.save / f"{policy_name(file)}_{rollout.transmission}{number}.npz"))
     return _present(rollouts, args, page, overlay=len(levels) > 1)
 
 
@@ -211,7 +211,7 @@ def live(args: argparse.Namespace) -> int:
     meshcat_code()  # a missing meshcat is reported before the compilation
     options = {name: getattr(args, name) for name in ("transmission", "ghost", "terrain")}
     setup = named(args.name, args.env or "", kwargs=dict(args.env_args), **options)
-    serve(Runner(setup, args.out), "live", open_browser=args.open)
+    serve(Runner(setup, args.folder), "live", open_browser=args.open)
     return 0
 
 

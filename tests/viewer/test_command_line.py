@@ -133,7 +133,7 @@ def test_view_simulates_a_policy(stander: Path, capsys: pytest.CaptureFixture[st
 @pytest.mark.slow
 def test_play_shows_levels_as_ghosts_of_the_same_start(stander: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["play", "stander", "--transmission", "exact", "armature", "--command", "0.4", "0.5", "0", "0"]
-    assert main([*command, "--out", "kept"]) == 0
+    assert main([*command, "--save", "kept"]) == 0
     assert capsys.readouterr().out.split() == ["kept/stander_exact.npz", "kept/stander_armature.npz", "stander.html"]
     exact, armature = (Rollout.load(f"kept/stander_{level}.npz") for level in ("exact", "armature"))
     assert (exact.transmission, armature.transmission) == ("exact", "armature")
