@@ -100,7 +100,8 @@ class StepDerivatives:
         self._other_sizes = {name: variable.size for name, variable in self._input_gradients.items()}
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _copied, (self.simulator, self._keep_every, self._records)
+        left = self._where_left(self._records[-1]) if self._records else {}
+        return _copied, (self.simulator, self._keep_every, self._records, left)
 
     def __copy__(self) -> StepDerivatives:
         return copy.deepcopy(self)  # of the simulator and the record, too
@@ -390,11 +391,23 @@ def _parts_of(simulator: Simulator, rows: Mapping[str, NDArray], target: NDArray
     return parts
 
 
-def _copied(simulator: Simulator, keep_every: int, records: list[Record]) -> StepDerivatives:
-    """Return derivatives of a simulator with records whose arrays a copy may have moved to unaligned memory."""
+def _copied(
+    simulator: Simulator, keep_every: int, records: list[Record], left: dict[str, NDArray[np.bool_]]
+) -> StepDerivatives:
+    """Return derivatives of a simulator with records whose arrays a copy may have moved to unaligned memory.
+
+    Args:
+        simulator: The copy.
+        keep_every: See `StepDerivatives`.
+        records: Of the original.
+        left: Which robots of the original are at the end of the last record, by part of the state.
+    """
     derivatives = StepDerivatives(simulator, keep_every)
     aligned = [{name: aligned_copy(array) for name, array in record.arrays.items()} for record in records]
     derivatives._records = [replace(record, arrays=arrays) for record, arrays in zip(records, aligned, strict=True)]
+    if records:
+        versions = derivatives._versions()
+        derivatives._records[-1].after = {name: np.where(at_end, versions[name], -1) for name, at_end in left.items()}
     return derivatives
 
 

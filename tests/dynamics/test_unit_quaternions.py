@@ -77,9 +77,7 @@ def test_what_is_of_unit_length_keeps_its_bits(model: Model):
     np.testing.assert_array_equal(unit_quaternions(q, first), q)
 
 
-@pytest.mark.parametrize(
-    ("factor", "norm"), [(LARGE, "0.97"), (1.0011, "1.001"), (0.0, "0"), (-2.0, "2"), (np.inf, "inf")]
-)
+@pytest.mark.parametrize(("factor", "norm"), [(LARGE, "0.97"), (1.0011, "1.001"), (0.0, "0"), (-2.0, "2")])
 def test_others_are_refused_in_one_line(model: Model, factor: float, norm: str):
     """By entry, norm and remedy; -1 is as good as 1."""
     q, v = states(model, (2, 3))

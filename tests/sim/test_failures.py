@@ -41,7 +41,8 @@ def test_a_bad_number_anywhere_is_flagged_and_stays_in_its_lane(model: Model, na
     target = model.standing_q[7:]
     clean = Simulator(model, N)
     clean.step(target, 5)
-    for entry in range(clean._arrays[name].shape[1]):
+    feet = 2 * sum(contact.group == "foot" for contact in model.robot.contacts)  # others do not act in the air
+    for entry in range(feet if name == "anchor" else clean._arrays[name].shape[1]):
         sim = Simulator(model, N)
         sim._arrays[name][0, entry, BAD] = np.nan
         sim.step(target, 5)

@@ -12,7 +12,18 @@ from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.integrators.plan import Rates
 from ce_gym.dynamics.laws.scene_laws import iterations_needed
 from ce_gym.dynamics.stepping.trace import step_function
-from ce_gym.model import Body, ContactMaterial, ContactSphere, Gains, Inertial, Joint, Motor, Placement, Robot
+from ce_gym.model import (
+    Body,
+    ContactMaterial,
+    ContactSphere,
+    Gains,
+    Inertial,
+    Joint,
+    LinearConstraint,
+    Motor,
+    Placement,
+    Robot,
+)
 from ce_gym.sim.substeps import substeps
 
 OUTPUTS = ("torque", "motor_speed", "power", "contact_forces", "energy")
@@ -27,13 +38,15 @@ def hopper() -> Robot:
     block = Body("block", "link", None, Placement(), Joint("free"), inertial(2.0, 0.01))
     joint = Joint("revolute", (0.0, 1.0, 0.0), torque=1.0, damping=0.01)
     leg = Body("leg", "link", "block", Placement(), joint, inertial(0.1, 1e-4))
+    rotor = Body("leg_rotor", "rotor", "block", Placement(), Joint("revolute", (0.0, 1.0, 0.0)), inertial(0.01, 1e-6))
+    gear = LinearConstraint("gear", (("leg_rotor", 1.0), ("leg", -1.0)))
     contacts = tuple(ContactSphere(f"corner_{x}", "block", (0.1 * x, 0.0, -0.05), 0.01) for x in (-1, 1))
     contacts += (ContactSphere("foot", "leg", (0.05, 0.0, -0.05), 0.01),)
-    gains, motors = Gains((("leg", 8.0),), (("leg", 0.1),)), (Motor("leg", 1.0, 40.0),)
+    gains, motors = Gains((("leg", 8.0),), (("leg", 0.1),)), (Motor("leg_rotor", 1.0, 40.0),)
     return Robot(
         "hopper",
-        (block, leg),
-        (),
+        (block, leg, rotor),
+        (gear,),
         ("leg",),
         contacts=contacts,
         motors=motors,
