@@ -7,7 +7,7 @@ and GPUs that follow IEEE 754 give the same bits. About 70 % of a step's CasADi 
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
@@ -17,6 +17,8 @@ REMOVED, SELECT, FMA, FMS, FNMA = -1, -2, -3, -4, -5
 """Operations that CasADi lacks: removed by a rewriting; of (a, b, c): `b if a else c`, `a b + c`, `a b - c`,
 `c - a b`."""
 
+COMMUTATIVE = (casadi.OP_ADD, casadi.OP_MUL, casadi.OP_AND, casadi.OP_OR)
+"""Operations whose operands can be exchanged."""
 NO_OPERATION = (casadi.OP_INPUT, casadi.OP_CONST, casadi.OP_OUTPUT, REMOVED)
 """Nothing is computed for these."""
 
@@ -71,7 +73,9 @@ def reached(nodes: Iterable[int], neighbours: Mapping[int, Iterable[int]]) -> se
 def graph_of(function: casadi.Function) -> Graph:
     """Return the graph of an SX function, rewritten."""
     graph = instructions_of(function)
+    _merge_equals(graph)
     _form_selects(graph)
+    _share_choices(graph)
     _select_between_sums(graph)
     _use_reciprocals(graph)
     _fuse_multiply_adds(graph)
@@ -100,6 +104,24 @@ def instructions_of(function: casadi.Function) -> Graph:
     return graph
 
 
+def _merge_equals(graph: Graph) -> None:
+    """Let equal operations on equal operands be one node; CasADi finds most of them, but not in choices."""
+    first: dict[tuple[object, ...], int] = {}
+    same: dict[int, int] = {}
+    for k, op in enumerate(graph.ops):
+        operands = tuple(same.get(a, a) for a in graph.operands[k])
+        if op in COMMUTATIVE:
+            operands = tuple(sorted(operands))
+        if op in NO_OPERATION:
+            graph.replace(k, op, *operands)
+        elif (op, operands) in first:
+            same[k] = first[op, operands]
+            graph.replace(k, REMOVED)
+        else:
+            first[op, operands] = k
+            graph.replace(k, op, *operands)
+
+
 def _form_selects(graph: Graph) -> None:
     """Rewrite `if_else_zero(c, x) + if_else_zero(not c, y)`, which is CasADi's `if_else`, as `select(c, x, y)`."""
     ops, operands, users = graph.ops, graph.operands, graph.users()
@@ -114,6 +136,43 @@ def _form_selects(graph: Graph) -> None:
                     if users[part] == [k]:
                         graph.replace(part, REMOVED)
                 break
+
+
+def _share_choices(graph: Graph) -> None:
+    """Rewrite `if_else_zero(c, x y)` as `if_else_zero(c, x) y` where several choices have the same `c` and `x`.
+
+    CasADi moves products and signs into choices, which takes one choice for each product and prevents multiply-adds.
+    """
+    ops, operands, made = graph.ops, graph.operands, {}
+
+    def node(op: int, *of: int) -> int:
+        if (op, *of) not in made:
+            made[op, *of] = graph.add(op, *of)
+        return made[op, *of]
+
+    waiting = True
+    while waiting:
+        products = {}
+        for k, op in enumerate(ops):
+            if op == casadi.OP_IF_ELSE_ZERO:
+                condition, x = operands[k]
+                made[op, condition, x] = k
+                negative = ops[x] == casadi.OP_NEG
+                x = operands[x][0] if negative else x
+                if ops[x] == casadi.OP_MUL:
+                    products[k] = condition, operands[x], negative
+        counts = Counter((c, x) for c, factors, _ in products.values() for x in set(factors))
+        waiting = False
+        for k, (c, factors, negative) in products.items():
+            x, y = sorted(factors, key=lambda factor: -counts[c, factor])
+            if counts[c, x] > 1:
+                choice = node(casadi.OP_IF_ELSE_ZERO, c, x)
+                graph.replace(k, casadi.OP_MUL, node(casadi.OP_NEG, choice) if negative else choice, y)
+                waiting = True
+    used = graph.ancestors([k for k, op in enumerate(ops) if op == casadi.OP_OUTPUT])
+    for k, op in enumerate(ops):
+        if k not in used and op not in (casadi.OP_INPUT, casadi.OP_CONST):
+            graph.replace(k, REMOVED)
 
 
 def _select_between_sums(graph: Graph) -> None:
