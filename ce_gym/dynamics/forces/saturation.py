@@ -18,6 +18,11 @@ from ce_gym.dynamics.forces.linear import JointForce, Motion
 ITERATIONS = 4
 """How many iterations of a step saturation may ask for after the first."""
 
+SHORT = 1e-6
+"""Share of a limit by which an expected torque stays short of it."""
+LARGE = 1e30
+"""Keeps infinite limits infinite [N m or N]."""
+
 
 @dataclass
 class Saturation:
@@ -71,16 +76,19 @@ class Saturation:
         """Return it with the active set at the end of the step, given the accelerations.
 
         The predicted end-of-step torque keeps its violation of a limit as the next guess. It never goes from beyond one
-        limit to beyond the other, because the range between has not been tried then.
+        limit to beyond the other, because the range between has not been tried then: it stays short of the other, by
+        more than rounding, because other functions that read the iterate round the limits differently.
         """
         asked = self.asked.at(ydd)
+        short_of_high = self.high.tau - SHORT * ca.fmin(ca.fabs(self.high.tau), LARGE)
+        short_of_low = self.low.tau + SHORT * ca.fmin(ca.fabs(self.low.tau), LARGE)
         if ca.sparsify(self.high.slope).nnz() or ca.sparsify(self.low.slope).nnz():
             over = asked - self.high.at(ydd)
             under = self.low.at(ydd) - asked
-            within = ca.fmax(self.low.tau, ca.fmin(self.high.tau, asked))
+            within = ca.fmax(short_of_low, ca.fmin(short_of_high, asked))
             asked = ca.if_else(over > 0, self.high.tau + over, ca.if_else(under > 0, self.low.tau - under, within))
-        kept = ca.if_else(self.at_low, ca.fmin(asked, self.high.tau), asked)
-        return replace(self, expected=ca.if_else(self.at_high, ca.fmax(asked, self.low.tau), kept))
+        kept = ca.if_else(self.at_low, ca.fmin(asked, short_of_high), asked)
+        return replace(self, expected=ca.if_else(self.at_high, ca.fmax(asked, short_of_low), kept))
 
 
 @dataclass
