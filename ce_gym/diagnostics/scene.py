@@ -26,7 +26,9 @@ from ce_gym.dynamics.integrators.methods import METHODS
 from ce_gym.dynamics.laws.scene_laws import symbolic_state
 from ce_gym.dynamics.laws.scene_parameters import make_scene
 from ce_gym.dynamics.model import Model
-from ce_gym.dynamics.stepping.step import first_iterate, solve
+from ce_gym.dynamics.recursion.joint_space import LONGEST_BRANCH
+from ce_gym.dynamics.stepping.step import first_iterate, in_joint_space, linearise, solve
+from ce_gym.dynamics.stepping.trace import Given
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.task.tasks import Task
@@ -123,6 +125,7 @@ class SceneReport:
     Attributes:
         name: Id of the environment.
         program: The task on the robot.
+        solver: Algorithm that finds the accelerations.
         layers: Features of a sub-step, in the order in which they are added; they sum to the sub-step.
         once: Action, bookkeeping and terms, which run once in each environment step, in the order of addition.
         sometimes: Functions that run only if some robot of a tile needs them: another iteration, a reset.
@@ -131,6 +134,7 @@ class SceneReport:
 
     name: str
     program: TaskProgram
+    solver: str
     layers: tuple[Item, ...]
     once: tuple[Item, ...]
     sometimes: tuple[Item, ...]
@@ -184,11 +188,22 @@ def count_instructions(env_id: str, **arguments: Any) -> SceneReport:
     return SceneReport(
         name=env_id,
         program=program,
+        solver=solver_of(program),
         layers=tuple(_layer_items(sub_step)),
         once=tuple(_once(program)),
         sometimes=tuple(Item("where needed", name, f.n_instructions()) for name, f in sometimes),
         unused=unused(program),
     )
+
+
+def solver_of(program: TaskProgram) -> str:
+    """Return the name of the algorithm that finds the accelerations in a scene."""
+    given = Given(program.model.mechanism, program.options)
+    system = linearise(given.scene, given.state, given.target, given.dt, first_iterate(given.scene))
+    short = (
+        f"elimination in joint space (no branch has more than {LONGEST_BRANCH} coordinates, those of the base included)"
+    )
+    return short if in_joint_space(system) else "CE-ABA"
 
 
 def layers(whole: SubStep) -> Iterator[tuple[str, int]]:
@@ -256,6 +271,7 @@ def as_text(report: SceneReport) -> str:
             f"{n} sub-steps of {1e3 * task.dt:g} ms in a step",
             "Instructions are scalar operations of the traced functions, for one robot.",
             "A line has the instructions that it adds to the lines above.",
+            f"Accelerations are solved by {report.solver}.",
             "",
             "A sub-step",
             table_text(columns, [*layer_rows, ("sub-step", report.sub_step)]),

@@ -21,7 +21,7 @@ def contact(
     velocity: list[float], *, gain=(0.0, 0.0, 0.0), slip=(0.0, 0.0, 0.0), count: int = 0, friction: str = "tangent"
 ) -> LinearContact:
     """A loaded point 1 mm in the ground, about an iterate."""
-    touch = Touch(SX(UP), SX(3, 1), SX(0.001), SX(velocity), SX(3, 1), SX(LOAD), SX(3, 1))
+    touch = Touch(SX.eye(3), SX(UP), SX(3, 1), SX(0.001), SX(velocity), SX(3, 1), SX(LOAD), SX(3, 1))
     material = Compliance(SX(5e4), SX(100.0), None, SX(MU), SX(SLIP_SPEED), SX(BRISTLE))
     law = Contact("foot", touch, material, KelvinVoigt(), FRICTION[friction], DT)
     return law.linearise(SX([*gain, *slip, 1.0 if count else 0.0, float(count)]))
@@ -33,7 +33,7 @@ def numbers(x: SX) -> np.ndarray:
 
 def motion(gain) -> Motion:
     """Accelerations of which the point's velocity gains that much in a step."""
-    return Motion(SX(0, 1), {"foot": ca.vertcat(SX(3, 1), SX(list(gain)) / DT)}, {"foot": SX(3, 1)})
+    return Motion(SX(0, 1), {"foot": ca.vertcat(SX(3, 1), SX(list(gain)) / DT)}, SX(3, 1))
 
 
 def tangential(point: LinearContact, gain=(0.0, 0.0, 0.0)) -> np.ndarray:

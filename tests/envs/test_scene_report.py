@@ -55,6 +55,11 @@ def test_lines_add_up_to_the_kernel(report: SceneReport):
     }
 
 
+def test_the_report_names_the_solver(report: SceneReport):
+    assert "Accelerations are solved by elimination in joint space" in as_text(report)
+    assert "Accelerations are solved by CE-ABA." in as_text(count_instructions("ce_gym/MitHumanoidStand-v0"))
+
+
 def test_lines_add_up_whatever_a_task_asks_for():
     """Late actions, randomised figures, noise, history, pushes, a critic, forces for recording, limited motors."""
     report = count_instructions(

@@ -78,6 +78,14 @@ class Transform:
         A_parent = mirrored(A + P @ B.T - B_parent @ P)
         return symmetric_blocks(A_parent, B_parent, C)
 
+    def rigid_inertia_to_parent(self, inertia: SX) -> SX:
+        """Take the (6, 6) inertia of a rigid body from child to parent coordinates, in half as many instructions."""
+        mass, moment = inertia[5, 5], ca.sparsify(ca.vertcat(inertia[2, 4], inertia[0, 5], inertia[1, 3]))
+        turned, P = self.E.T @ moment, skew(self.p)
+        across = P @ skew(turned)
+        A = mirrored(self.E.T @ inertia[:3, :3] @ self.E) - mirrored(across + across.T + mass * (P @ P))
+        return symmetric_blocks(A, skew(turned + mass * self.p), mass * SX.eye(3))
+
     def after(self, parent: Transform) -> Transform:
         """Return the transform that applies `parent` first, then this one."""
         return Transform(self.E @ parent.E, parent.p + parent.E.T @ self.p)

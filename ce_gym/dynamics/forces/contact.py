@@ -78,9 +78,10 @@ class Compliance:
 
 @dataclass
 class Touch:
-    """Where a sphere is above the ground and how it moves. In body axes.
+    """Where a sphere is above the ground and how it moves, in world axes, where the normal of flat ground is constant.
 
     Attributes:
+        R: Rotation of the body, body to world, shape (3, 3).
         normal: Unit normal out of the ground, shape (3,).
         point: The sphere's lowest point, in the body frame [m], shape (3,).
         depth: How far it is in the ground [m].
@@ -90,6 +91,7 @@ class Touch:
         anchor: Deflection of the bristle, shape (3,) [m].
     """
 
+    R: SX
     normal: SX
     point: SX
     depth: SX
@@ -124,8 +126,8 @@ def touch_ground(
     velocity, drift = body.point_velocity(point), body.drift[3:] + cross(body.drift[:3], point)
     deflection = SX(3, 1)
     if anchor.numel():  # in the tangent plane: the normal has no part in it
-        deflection = body.R.T @ ca.vertcat(anchor, -ca.dot(normal[:2], anchor) / normal[2])
-    return Touch(n, point, depth, velocity, drift, load, deflection)
+        deflection = ca.sparsify(ca.vertcat(anchor, -ca.dot(normal[:2], anchor) / normal[2]))
+    return Touch(body.R, normal, point, depth, body.R @ velocity, body.R @ drift, load, deflection)
 
 
 class NormalLaw(Protocol):
@@ -141,10 +143,10 @@ class TangentialForce:
     """Friction, linear in the velocity `v + gain` of the point about an iterate: `-force - slope (v_t+ - v_t)`.
 
     Attributes:
-        force: At the iterate, against the motion, body axes [N], shape (3,).
+        force: At the iterate, against the motion, world axes [N], shape (3,).
         slope: In the tangent plane, but none along the slip [N s/m].
         slip: Direction in which it slips, shape (3,); zero while it sticks.
-        gain: Change of the velocity in the step at the iterate, body axes [m/s], shape (3,).
+        gain: Change of the velocity in the step at the iterate, world axes [m/s], shape (3,).
     """
 
     force: SX
@@ -176,7 +178,7 @@ class Iterate:
     """Result of the iteration before for one contact; zero in the first iteration.
 
     Attributes:
-        gain: Change of the point's velocity in the step, body axes [m/s], shape (3,).
+        gain: Change of the point's velocity in the step, world axes [m/s], shape (3,).
         slip: Direction of the slip, shape (3,); zero if the contact stuck.
         active: 1 if the contact was active, else 0.
         count: How many iterations have been made.
@@ -244,8 +246,8 @@ class LinearContact:
         body: Name of the body that carries it.
         iterate: From the iteration before.
         active: 1 if it is taken to touch the ground, else 0.
-        force: For an unchanged velocity, body axes [N], shape (3,).
-        C: Effective damping, body axes [N s/m], shape (3, 3).
+        force: For an unchanged velocity, world axes [N], shape (3,).
+        C: Effective damping, world axes [N s/m], shape (3, 3).
         load: Normal force that limits friction [N].
         slip: Direction in which friction slips, shape (3,); zero while it sticks.
     """
@@ -273,9 +275,9 @@ class LinearContact:
             self.load = ca.if_else(t.load > 0, t.load, ca.fmax(force - shared * before, 0))
         friction, n = law.friction.linearise(self), t.normal
         self.slip, slope = friction.slip, friction.slope
-        along = slope * (self.slip @ self.slip.T)
-        self.C = mirrored(slope * SX.eye(3) + (self.normal_slope - slope) * (n @ n.T) - along)
-        self.force = self.normal_after(friction.gain) * n - friction.force + self.C @ friction.gain
+        tangential = ca.sparsify(mirrored(slope * (SX.eye(3) - n @ n.T - self.slip @ self.slip.T)))
+        self.C = ca.sparsify(tangential + self.normal_slope * (n @ n.T))
+        self.force = self.normal_after(SX(3, 1)) * n - friction.force + tangential @ friction.gain
 
     def _closing(self, gain: SX) -> SX:
         """Return the normal velocity [m/s] for a change of the velocity; negative towards the ground."""
@@ -292,12 +294,12 @@ class LinearContact:
 
     @property
     def sliding(self) -> SX:
-        """Velocity of the point in the tangent plane, body axes [m/s], shape (3,)."""
+        """Velocity of the point in the tangent plane, world axes [m/s], shape (3,)."""
         return self._tangential(self.law.touch.velocity)
 
     def _tangential(self, velocity: SX) -> SX:
         n = self.law.touch.normal
-        return velocity - ca.dot(n, velocity) * n
+        return ca.sparsify(velocity - ca.dot(n, velocity) * n)
 
     def trial(self, gain: SX) -> tuple[SX, SX, SX, SX]:
         """Return the cone [N], and the slope [N s/m] and force (3,) [N] of a bristle that sticks, with its norm."""
@@ -314,19 +316,21 @@ class LinearContact:
         """Return the terms of the contact on its body in the inward pass.
 
         Args:
-            gravity: Acceleration of free fall in body axes, shape (3,); the recursion's `a` does not contain it.
+            gravity: Acceleration of free fall, world axes, shape (3,); the recursion's `a` does not contain it.
         """
         touch, dt = self.law.touch, self.law.dt
-        r = skew(touch.point)
-        rC = r @ self.C
-        inertia = symmetric_blocks(mirrored(rC @ r.T), rC, self.C) * dt
-        force = self.force - dt * (self.C @ (gravity - touch.drift))
+        r, C = skew(touch.point), mirrored(touch.R.T @ self.C @ touch.R)
+        rC = r @ C
+        inertia = symmetric_blocks(mirrored(rC @ r.T), rC, C) * dt
+        force = touch.R.T @ (self.force - dt * (self.C @ (gravity - touch.drift)))
         return BodyTerms(inertia, ca.vertcat(cross(touch.point, force), force))
 
     def gain(self, motion: Motion) -> SX:
-        """Return the change of the point's velocity in the step, body axes [m/s], shape (3,)."""
+        """Return the change of the point's velocity in the step, world axes [m/s], shape (3,)."""
+        if self in motion.gains:
+            return motion.gains[self]
         touch, a = self.law.touch, motion.a[self.body]
-        return self.law.dt * (a[3:] + cross(a[:3], touch.point) + motion.gravity[self.body] - touch.drift)
+        return self.law.dt * (touch.R @ (a[3:] + cross(a[:3], touch.point)) + motion.gravity - touch.drift)
 
     def check(self, motion: Motion) -> SX:
         """Return 1 if the active set is not the one that was assumed; else 0.
@@ -347,7 +351,7 @@ class LinearContact:
         return ca.vertcat(self.gain(motion), self.slip, self.active, self.iterate.count + 1)
 
     def force_after(self, gain: SX) -> SX:
-        """Return the force over the step, body axes [N], given the gain in velocity."""
+        """Return the force over the step, world axes [N], given the gain in velocity."""
         return self.force - self.C @ gain
 
     def normal_after(self, gain: SX) -> SX:
@@ -359,7 +363,7 @@ class LinearContact:
         return self.normal_force - self._slope_at_end * self._closing(gain)
 
     def anchor_after(self, gain: SX) -> SX:
-        """Return the deflection of the bristle at the end of the step, body axes [m], given the gain in velocity."""
+        """Return the deflection of the bristle at the end of the step, world axes [m], given the gain in velocity."""
         touch = self.law.touch
         s = touch.anchor + self.law.dt * self._tangential(touch.velocity + gain)
         return s * ca.fmin(1, self._cone() / (self.law.compliance.bristle * _length(s)))

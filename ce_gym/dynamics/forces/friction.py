@@ -38,7 +38,7 @@ class Tangent:
         slip direction is unknown, as several may be released at once.
         """
         last, slipped = contact.iterate.last, contact.iterate.slip
-        gain = ca.if_else(last, 0, contact.iterate.gain)
+        gain = linearised_about(contact)
         cone, slope, x, size = contact.trial(gain)
         reversed_slip = ca.logic_and(ca.sumsqr(slipped) > 0.5, ca.dot(slipped, x) <= cone)
         slips = ca.logic_and(size > cone, ca.logic_or(last, ca.logic_not(reversed_slip)))
@@ -70,9 +70,14 @@ class Secant:
         return SX(0)
 
 
+def linearised_about(contact: LinearContact) -> SX:
+    """Return the change of the velocity that the tangent is about; none in the last iteration."""
+    return ca.if_else(contact.iterate.last, 0, contact.iterate.gain)
+
+
 def released(contact: LinearContact) -> SX:
     """Return 1 in a second iteration if the contact stuck in the first one and left the cone; else 0."""
-    cone, _, _, size = contact.trial(contact.iterate.gain)
+    cone, _, _, size = contact.trial(linearised_about(contact))
     stuck = ca.logic_and(contact.iterate.count > 0.5, ca.sumsqr(contact.iterate.slip) < 0.5)
     return ca.logic_and(stuck, size > cone)
 

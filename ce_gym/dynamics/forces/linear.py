@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.dynamics.recursion.ce_aba import Articulation
@@ -41,11 +43,13 @@ class Motion:
     Attributes:
         ydd: Of the independent joints, shape (nj,).
         a: Of each body minus gravity, body coordinates, shape (6,) each.
-        gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
+        gravity: Acceleration of free fall, world axes, shape (3,).
         articulation: Inertias of the recursion that found them; None if it is unknown.
+        gains: Change of the velocity of points in the step where it is known otherwise, by contact, shape (3,) each.
     """
 
     ydd: SX
     a: dict[str, SX]
-    gravity: dict[str, SX]
+    gravity: SX
     articulation: Articulation | None = None
+    gains: Mapping[Any, SX] = field(default_factory=dict)

@@ -35,7 +35,6 @@ from ce_gym.dynamics.recursion.ce_aba import (
     Articulation,
     BodyTerms,
     gravity_acceleration,
-    outward_acceleration_pass,
 )
 from ce_gym.dynamics.recursion.kinematics import BodyState, Kinematics, constant
 from ce_gym.dynamics.standing import Standing, standing_pose
@@ -83,6 +82,10 @@ class Ends:
         """Return what of a spatial motion of the body (6,) moves the point away from the other's."""
         return ca.dot(self.push, motion[3:] + cross(motion[:3], self.point))
 
+    def jacobian(self, J: SX) -> SX:
+        """Return the Jacobian (1, nv) of what `along` returns, given that of the point in world axes, shape (3, nv)."""
+        return (self.body.R @ self.push).T @ J
+
     @property
     def wrench(self) -> SX:
         """Wrench of a unit force on the body, body coordinates, shape (6,)."""
@@ -113,6 +116,8 @@ class LinearPair(LinearContact):
 
     def gain(self, motion: Motion) -> SX:
         """Return the change of the normal velocity in the step [m/s], as the first of (3,)."""
+        if self in motion.gains:
+            return motion.gains[self]
         first, second = (end.along(motion.a[end.name] - end.body.drift) for end in self.law.ends)
         return _normal(self.law.dt * (first + second))
 
@@ -149,7 +154,7 @@ def pair_between(
     closing = first.along(first.body.v) + second.along(second.body.v)
     depth = capsules[0].radius + capsules[1].radius - distance
     still = SX(3, 1)
-    touch = Touch(_normal(SX(1)), still, depth, _normal(closing), still, load, still)
+    touch = Touch(SX.eye(3), _normal(SX(1)), still, depth, _normal(closing), still, load, still)
     names, ends = f"{first.name} {second.name}", (first, second)
     return Pair(names, touch, compliance, normal, Frictionless(), dt, ends)
 
@@ -214,8 +219,9 @@ def solve_pair_forces(
     articulation: Articulation,
     pairs: Sequence[LinearPair],
     forces: SX,
-) -> tuple[SX, dict[str, SX]]:
-    """Find the accelerations with the forces of pairs, as `outward_acceleration_pass` returns them.
+    carried: bool = True,
+) -> Articulation:
+    """Return the articulation with the forces of pairs.
 
     Let `Y` be the generalised force that a unit force of each pair leaves at a cluster or the base in the inward pass,
     `u` that of all other forces, `d` the acceleration of the carrier of a cluster while vdot is zero, and `J` the
@@ -228,13 +234,14 @@ def solve_pair_forces(
         articulation: From the inward pass, in terms of the forces.
         pairs: About an iterate.
         forces: Symbols of their forces, shape (n_pairs,).
+        carried: Whether handles accelerate while all of vdot is zero; not in joint space.
     """
     n, near = len(pairs), pairs[0].law.near
     left = {k: _apart(u, forces) for k, u in articulation.u.items()}
     gains, acting = SX(n, n + 1), replace(articulation, u={}, stretched={})
     for k, (Y, u) in left.items():
         if Y.nnz():
-            free = u - articulation.U[k].T @ _carried(mechanism, kinematics, articulation, k)
+            free = u - articulation.U[k].T @ _carried(mechanism, kinematics, articulation, k) if carried else u
             gains += Y.T @ solve_positive_definite(articulation.D[k], ca.horzcat(Y, free))
     if articulation.base is not None:
         inertia, (Y, wrench) = articulation.base[0], _apart(articulation.base[1], forces)
@@ -247,7 +254,7 @@ def solve_pair_forces(
     acting.u = {k: where(near, u + Y @ pressed, u) for k, (Y, u) in left.items()}
     if articulation.base is not None:
         acting.base = inertia, where(near, wrench + Y @ pressed, wrench)
-    return outward_acceleration_pass(mechanism, kinematics, acting)
+    return acting
 
 
 def _apart(u: SX, forces: SX) -> tuple[SX, SX]:

@@ -100,7 +100,7 @@ class ContactForces(LinearForce):
 
     def add_to(self, loads: Loads) -> None:
         """Add the contacts to their bodies."""
-        loads.bodies.update(with_contacts(loads.bodies, self.contacts, loads.gravity))
+        loads.contacts += self.contacts
 
     def check(self, motion: Motion) -> SX:
         """Return 1 if the active set of a contact has changed, else 0."""
@@ -115,24 +115,22 @@ class ContactForces(LinearForce):
         loads = [where(c.law.near, ca.fmax(c.load_after(c.gain(motion)), 0)) for c in self.contacts]
         after = {"load": ca.vertcat(*loads)}
         if self.start.state["anchor"].numel():
-            turned = [(self._rotation(c) @ c.anchor_after(c.gain(motion)))[:2] for c in self.contacts]
-            after["anchor"] = ca.vertcat(*[where(c.law.near, x) for c, x in zip(self.contacts, turned, strict=True)])
+            after["anchor"] = ca.vertcat(
+                *[where(c.law.near, c.anchor_after(c.gain(motion))[:2]) for c in self.contacts]
+            )
         return after
 
     def rates(self) -> dict[str, SX]:
         """Return the rates of the bristles' deflections."""
         if not self.start.state["anchor"].numel():
             return {}
-        slides = [ca.if_else(c.normal_slope > 0, (self._rotation(c) @ c.sliding)[:2], 0) for c in self.contacts]
+        slides = [ca.if_else(c.normal_slope > 0, c.sliding[:2], 0) for c in self.contacts]
         return {"anchor": ca.vertcat(*slides)}
 
     def output(self, name: str, motion: Motion, after: State) -> SX:
         """Return the mean force on each contact over the step, world axes [N], shape (3, n_contacts)."""
-        forces = [where(c.law.near, self._rotation(c) @ c.force_after(c.gain(motion))) for c in self.contacts]
+        forces = [where(c.law.near, c.force_after(c.gain(motion))) for c in self.contacts]
         return with_hulls(ca.horzcat(SX(3, 0), *forces), self.start.scene.options.hulls)
-
-    def _rotation(self, contact: LinearContact) -> SX:
-        return self.start.kinematics.bodies[contact.body].R
 
 
 def culled_groups(robot: Robot, touches: Sequence[str]) -> dict[str, list[int]]:
@@ -174,13 +172,11 @@ def contacts_at(start: Start) -> list[Contact]:
     return contacts
 
 
-def with_contacts(
-    bodies: dict[str, BodyTerms], contacts: Sequence[LinearContact], gravity: dict[str, SX]
-) -> dict[str, BodyTerms]:
-    """Return the terms of bodies with contacts added, given the acceleration of free fall in the axes of each body."""
+def with_contacts(bodies: dict[str, BodyTerms], contacts: Sequence[LinearContact], gravity: SX) -> dict[str, BodyTerms]:
+    """Return the terms of bodies with contacts added, given the acceleration of free fall in world axes, shape (3,)."""
     terms = dict(bodies)
     for contact in sorted(contacts, key=lambda contact: contact.law.near is None):  # sums of culled groups stand alone
-        new, old = contact.body_terms(gravity[contact.body]), terms.get(contact.body)
+        new, old = contact.body_terms(gravity), terms.get(contact.body)
         total, near = BodyTerms(old.inertia + new.inertia, old.force + new.force) if old else new, contact.law.near
         none = old or BodyTerms(SX(6, 6), SX(6, 1))
         terms[contact.body] = BodyTerms(where(near, total.inertia, none.inertia), where(near, total.force, none.force))

@@ -79,14 +79,16 @@ class Loads:
         bodies: Terms of bodies by name.
         balls: Forces on ball joints.
         joints: Forces on joints with one coordinate.
-        gravity: Acceleration of free fall in the axes of each body, shape (3,) each.
+        gravity: Acceleration of free fall, world axes, shape (3,).
+        contacts: Forces on points of bodies.
         pairs: Forces between two bodies, unknown until the recursion has run.
     """
 
     bodies: dict[str, BodyTerms]
     balls: JointForce
     joints: JointForce
-    gravity: dict[str, SX]
+    gravity: SX
+    contacts: list[LinearContact] = field(default_factory=list)
     pairs: list[LinearPair] = field(default_factory=list)
 
 

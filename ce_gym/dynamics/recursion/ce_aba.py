@@ -91,6 +91,23 @@ class Articulation:
     base: tuple[SX, SX] | None = None
     stretched: dict[int, Stretched] = field(default_factory=dict)
 
+    def acceleration(self, k: int, a: SX) -> SX:
+        """Return `D^-1 (u - U^T a)`, the acceleration of a cluster whose handle accelerates by `a`, shape (d,)."""
+        if k in self.stretched:
+            return self.stretched[k].acceleration(a)
+        return solve_positive_definite(self.D[k], self.u[k] - self.U[k].T @ a)
+
+
+@dataclass
+class Condensed:
+    """A cluster condensed to its handle: `D`, `U`, bias force, and inertia and bias force at the handle."""
+
+    D: SX
+    U: SX
+    bias: SX
+    inertia: SX
+    force: SX
+
 
 def inward_inertia_pass(
     mechanism: Mechanism,
@@ -123,36 +140,59 @@ def inward_inertia_pass(
             base = cluster.bodies[0]
             articulation.base = IA[base], joints.tau[rows] - pA[base]
             continue
-        transverse_bias = _add_transverse_inertias(mechanism, kinematics, k, IA, pA)
+        transverse_bias = add_transverse_inertias(mechanism, kinematics, k, IA, pA)
         handle = _handle_body(mechanism, cluster, mechanism.eliminated_rotors[k])
-        condensed = _Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
-        D = mirrored(condensed.D + joints.slope[rows, rows])
-        U, u = condensed.U, joints.tau[rows] - condensed.bias - transverse_bias
-        damping, drag = SX(*D.shape), SX(len(rows), 1)
-        if turning is not None and cluster.output_body is not None:
-            damping, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
-            D, u = mirrored(D + damping), u + drag
-        if stretches(mechanism, cluster):
-            D_joints, biased = mirrored(condensed.D + damping), ca.horzcat(U.T, drag - condensed.bias - transverse_bias)
-            D = mirrored(D_joints + joints.slope[rows, rows])
-            articulation.stretched[k] = Stretched.of(D_joints, joints.slope[rows, rows], biased, joints.tau[rows])
-        articulation.U[k], articulation.D[k], articulation.u[k] = U, D, u
-        articulation.inertia[k], articulation.handle_body[k] = condensed.D, handle.name if handle else None
-        if cluster.output_body is None:
-            continue
-        if k in articulation.stretched:
-            Ia, pa = articulation.stretched[k].articulated(condensed.inertia, condensed.force)
-        else:
-            solved = solve_positive_definite(D, ca.horzcat(U.T, u))  # D^-1 [U^T, u]
-            Ia = mirrored(condensed.inertia - U @ solved[:, :6])
-            pa = condensed.force + U @ solved[:, 6]
-        X = kinematics.bodies[handle.name].X if handle else Transform.identity()
-        IA[cluster.output_body] += X.inertia_to_parent(Ia)
-        pA[cluster.output_body] += X.force_to_parent(pa)
+        condensed = Condenser(mechanism, kinematics, k, handle).condense(IA, pA)
+        condensed.bias += transverse_bias
+        articulation.handle_body[k] = handle.name if handle else None
+        Ia, pa = eliminate(articulation, mechanism, kinematics, k, condensed, joints, turning)
+        if cluster.output_body is not None:
+            X = kinematics.bodies[handle.name].X if handle else Transform.identity()
+            IA[cluster.output_body] += X.inertia_to_parent(Ia)
+            pA[cluster.output_body] += X.force_to_parent(pa)
     return articulation
 
 
-def _add_transverse_inertias(
+def eliminate(
+    articulation: Articulation,
+    mechanism: Mechanism,
+    kinematics: Kinematics,
+    k: int,
+    condensed: Condensed,
+    joints: JointTerms,
+    turning: TurningDamping | None,
+) -> tuple[SX, SX]:
+    """Add the elimination of a cluster's accelerations to an articulation; return `inertia - U D^-1 U^T` and bias.
+
+    Args:
+        articulation: Of the clusters beyond, changed in place.
+        mechanism: The mechanism.
+        kinematics: From the outward velocity pass.
+        k: Number of the cluster.
+        condensed: The cluster without forces on its coordinates.
+        joints: Forces on the independent coordinates.
+        turning: Damping of joints on turning bodies, if there is a step.
+    """
+    cluster, rows = mechanism.tree.clusters[k], kinematics.rows[k]
+    tau, slope = joints.tau[rows], joints.slope[rows, rows]
+    damping, drag = SX(*slope.shape), SX(len(rows), 1)
+    if turning is not None and cluster.output_body is not None:
+        damping, drag = turning.on(condensed.D, rows, kinematics.bodies[cluster.output_body].v[:3])
+    D, u = mirrored(condensed.D + slope + damping), tau - condensed.bias + drag
+    if stretches(mechanism, cluster):
+        damped, biased = mirrored(condensed.D + damping), ca.horzcat(condensed.U.T, drag - condensed.bias)
+        D = mirrored(damped + slope)
+        articulation.stretched[k] = Stretched.of(damped, slope, biased, tau)
+    articulation.U[k], articulation.D[k], articulation.u[k] = condensed.U, D, u
+    articulation.inertia[k] = condensed.D
+    if k in articulation.stretched:
+        return articulation.stretched[k].articulated(condensed.inertia, condensed.force)
+    solved = solve_positive_definite(D, ca.horzcat(condensed.U.T, u))  # D^-1 [U^T, u]
+    inertia = mirrored(condensed.inertia - condensed.U @ solved[:, :-1])
+    return inertia, condensed.force + condensed.U @ solved[:, -1]
+
+
+def add_transverse_inertias(
     mechanism: Mechanism, kinematics: Kinematics, k: int, IA: dict[str, SX], pA: dict[str, SX]
 ) -> SX:
     """Add the transverse inertia of a cluster's rotors to their carriers, in place; return the cluster's bias, (d,)."""
@@ -198,10 +238,7 @@ def outward_acceleration_pass(
         a_output = a[cluster.output_body] if cluster.output_body is not None else ca.vertcat(SX(3, 1), -gravity)
         handle = articulation.handle_body[k]
         a_handle = kinematics.bodies[handle].X.motion(a_output) if handle else a_output
-        if k in articulation.stretched:
-            ydd = articulation.stretched[k].acceleration(a_handle)
-        else:
-            ydd = solve_positive_definite(articulation.D[k], articulation.u[k] - articulation.U[k].T @ a_handle)
+        ydd = articulation.acceleration(k, a_handle)
         vdot[rows] = ydd
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
         qdd = coordinates.G @ ydd + coordinates.g
@@ -237,29 +274,34 @@ def _handle_body(mechanism: Mechanism, cluster: Cluster, rotors: tuple[Eliminate
     return roots[0] if parallel else None
 
 
-@dataclass
-class _Condensed:
-    """A cluster condensed to its handle: `D`, `U`, bias force, and inertia and bias force at the handle."""
+class Condenser:
+    """Condenses one cluster to its handle: composite rigid bodies inside, projected by `G` outside.
 
-    D: SX
-    U: SX
-    bias: SX
-    inertia: SX
-    force: SX
+    Args:
+        mechanism: The mechanism.
+        kinematics: From the outward velocity pass.
+        k: Number of the cluster.
+        handle: The body whose frame is the handle; None for the frame of the output body.
+        rigid: Whether the inertias of its bodies are those of rigid bodies.
+    """
 
-
-class _Condenser:
-    """Condenses one cluster to its handle: composite rigid bodies inside, projected by `G` outside."""
-
-    def __init__(self, mechanism: Mechanism, kinematics: Kinematics, k: int, handle: MovingBody | None) -> None:
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        kinematics: Kinematics,
+        k: int,
+        handle: MovingBody | None = None,
+        rigid: bool = False,
+    ) -> None:
         self.mechanism, self.states, self.handle = mechanism, kinematics.bodies, handle
+        self.inertia_to_parent = Transform.rigid_inertia_to_parent if rigid else Transform.inertia_to_parent
         self.cluster, self.rotors = mechanism.tree.clusters[k], mechanism.eliminated_rotors[k]
         self.coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]
         self.moving = mechanism.moving(self.cluster)
         self.inside = {body.name: body for body in self.moving}
         self.n = self.coordinates.qd.numel()
 
-    def condense(self, IA: dict[str, SX], pA: dict[str, SX]) -> _Condensed:
+    def condense(self, IA: dict[str, SX], pA: dict[str, SX]) -> Condensed:
         """Return the condensed cluster, given articulated inertias and bias forces of its bodies."""
         G, index = self.coordinates.G, self.coordinates.index
         zeta = self._bias_accelerations()
@@ -273,13 +315,13 @@ class _Condenser:
             H[i, i] = ca.triu(H[i, i])  # of the three columns of a ball joint; the rest is one column each
             force, torques = self._to_handle(body, pA[body.name] + IA[body.name] @ zeta[body.name])
             force_at_handle, bias = force_at_handle + force, bias + torques
-            in_parent = self._transform(body).inertia_to_parent(composite[body.name])
+            in_parent = self.inertia_to_parent(self._transform(body), composite[body.name])
             if body.parent in self.inside:
                 composite[body.parent] += in_parent
             else:
                 at_handle += in_parent
         G, H, F = ca.sparsify(G), mirrored(_lower_to_upper(H)), ca.sparsify(F)
-        condensed = _Condensed(G.T @ H @ G, F @ G, G.T @ bias, at_handle, force_at_handle)
+        condensed = Condensed(G.T @ H @ G, F @ G, G.T @ bias, at_handle, force_at_handle)
         for rotor in self.rotors:
             self._add_rotor(condensed, rotor, zeta)
         return condensed
@@ -307,7 +349,7 @@ class _Condenser:
                 return force, torques
             body = self.inside[body.parent]
 
-    def _add_rotor(self, condensed: _Condensed, rotor: EliminatedRotor, zeta: dict[str, SX]) -> None:
+    def _add_rotor(self, condensed: Condensed, rotor: EliminatedRotor, zeta: dict[str, SX]) -> None:
         """Add a rotor in place, at the transmission level of the mechanism."""
         G, row, J = self.coordinates.G, self.coordinates.index[rotor.name], rotor.inertia
         G_r, g_r, thd = G[row, :], self.coordinates.g[row], self.coordinates.qd[row]

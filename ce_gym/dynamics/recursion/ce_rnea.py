@@ -33,8 +33,17 @@ def inverse_dynamics(mechanism: Mechanism, kinematics: Kinematics, vdot: SX) -> 
     return inward_force_pass(mechanism, kinematics, a, net_forces(mechanism, kinematics, a), qdd)
 
 
-def outward_acceleration(mechanism: Mechanism, kinematics: Kinematics, vdot: SX) -> tuple[dict[str, SX], list[SX]]:
-    """Return each body's acceleration minus gravity, shape (6,), and each cluster's spanning accelerations."""
+def outward_acceleration(
+    mechanism: Mechanism, kinematics: Kinematics, vdot: SX, a_base: SX | None = None
+) -> tuple[dict[str, SX], list[SX]]:
+    """Return each body's acceleration minus gravity, shape (6,), and each cluster's spanning accelerations.
+
+    Args:
+        mechanism: The mechanism.
+        kinematics: From the outward velocity pass.
+        vdot: Acceleration in the coordinates of `v`, shape (nv,).
+        a_base: Acceleration of a floating base minus gravity, shape (6,); the one in `vdot` if None.
+    """
     gravity = gravity_acceleration(mechanism)
     world = ca.vertcat(SX(3, 1), -gravity)
     a: dict[str, SX] = {}
@@ -44,7 +53,9 @@ def outward_acceleration(mechanism: Mechanism, kinematics: Kinematics, vdot: SX)
         if is_free(mechanism, cluster):
             base = cluster.bodies[0]
             state = kinematics.bodies[base]
-            a[base] = vdot[rows] + ca.vertcat(SX(3, 1), cross(state.v[:3], state.v[3:]) - state.R.T @ gravity)
+            if a_base is None:
+                a_base = vdot[rows] + ca.vertcat(SX(3, 1), cross(state.v[:3], state.v[3:]) - state.R.T @ gravity)
+            a[base] = a_base
             qdd.append(vdot[rows])
             continue
         coordinates: ClusterCoordinates = kinematics.coordinates[k]  # type: ignore[assignment]

@@ -29,8 +29,8 @@ class Stretched:
 
     Attributes:
         L: Lower triangle with ones, shape (d, d).
-        left: `L^-1 [U^T, u]`, shape (d, 7).
-        scaled: `diag(pivots)^-1 left`, shape (d, 7).
+        left: `L^-1 [U^T, u]`, shape (d, n + 1); n = 6 in CE-ABA.
+        scaled: `diag(pivots)^-1 left`, shape (d, n + 1).
     """
 
     L: SX
@@ -44,10 +44,10 @@ class Stretched:
         Args:
             inertia: `D` without `slope`, shape (d, d).
             slope: Slope of forces on coordinates, added to `inertia`, shape (d, d).
-            biased: `[U^T, u]` without forces on coordinates, shape (d, 7).
+            biased: `[U^T, u]` without forces on coordinates, shape (d, n + 1).
             tau: Forces on coordinates, shape (d,).
         """
-        n, forces = tau.numel(), ca.horzcat(SX(tau.numel(), 6), tau)[::-1, :]
+        n, forces = tau.numel(), ca.horzcat(SX(tau.numel(), biased.shape[1] - 1), tau)[::-1, :]
         inertia, slope, biased = inertia[::-1, ::-1], slope[::-1, ::-1], biased[::-1, :]
         L, pivoted, inverse_pivot, left = SX.eye(n), SX(n, n), [], []  # pivoted = L diag(pivots)
         for j in range(n):
@@ -61,15 +61,15 @@ class Stretched:
         return Stretched(L, ca.vertcat(*left), ca.vertcat(*scaled))
 
     def articulated(self, inertia: SX, force: SX) -> tuple[SX, SX]:
-        """Return `inertia - U D^-1 U^T`, its upper triangle mirrored, and `force + U D^-1 u`, (6, 6) and (6,)."""
+        """Return `inertia - U D^-1 U^T`, its upper triangle mirrored, and `force + U D^-1 u`, (n, n) and (n,)."""
         for j in range(self.L.shape[0]):
-            U, scaled = self.left[j, :6].T, self.scaled[j, :]
-            inertia, force = inertia - U @ scaled[:6], force + U @ scaled[6]
+            U, scaled = self.left[j, :-1].T, self.scaled[j, :]
+            inertia, force = inertia - U @ scaled[:-1], force + U @ scaled[-1]
         return mirrored(inertia), force
 
     def acceleration(self, a: SX) -> SX:
-        """Return `D^-1 (u - U^T a)`, shape (d,), of a cluster whose handle accelerates by `a`, shape (6,)."""
-        n, ydd = self.L.shape[0], self.scaled[:, 6] - self.scaled[:, :6] @ a
+        """Return `D^-1 (u - U^T a)`, shape (d,), of a cluster whose handle accelerates by `a`, shape (n,)."""
+        n, ydd = self.L.shape[0], self.scaled[:, -1] - self.scaled[:, :-1] @ a
         for i in reversed(range(n)):
             ydd[i] -= sum(self.L[k, i] * ydd[k] for k in range(i + 1, n))
         return ydd[::-1]

@@ -86,16 +86,15 @@ class Balance:
         Args:
             mechanism: The robot.
             kinematics: Where the wrenches act.
-            wrenches: Body and wrench on it [N m; N], in its axes about its origin, shape (6,).
+            wrenches: Body and wrench on it [N m; N], world axes, about its origin, shape (6,).
             duration: Of the wrenches [s].
         """
         if not mechanism.robot.floating:
             return self
         force, torque = mass_of(mechanism) * gravity_acceleration(mechanism), SX(3, 1)
         for name, wrench in wrenches:
-            body = kinematics.bodies[name]
-            push = body.R @ wrench[3:]
-            force, torque = force + push, torque + body.R @ wrench[:3] + cross(body.p - self.center, push)
+            arm = kinematics.bodies[name].p - self.center
+            force, torque = force + wrench[3:], torque + wrench[:3] + cross(arm, wrench[3:])
         return replace(self, angular=self.angular + duration * torque, linear=self.linear + duration * force)
 
     @property

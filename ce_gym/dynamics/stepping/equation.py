@@ -20,12 +20,11 @@ from ce_gym.dynamics.algebra.integration import tangent_basis
 from ce_gym.dynamics.algebra.spatial import SX, cross, quaternion_to_rotation
 from ce_gym.dynamics.forces.contact import LinearContact
 from ce_gym.dynamics.forces.scene import StepOptions
-from ce_gym.dynamics.laws.contacts import with_contacts
 from ce_gym.dynamics.laws.scene_laws import iterate_size
-from ce_gym.dynamics.recursion.ce_aba import BodyTerms, inward_inertia_pass
 from ce_gym.dynamics.recursion.ce_rnea import force_on_coordinates, inward_force_pass, net_forces, outward_acceleration
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping
-from ce_gym.dynamics.stepping.step import finish_step, finished, first_loads, linearise, stacked
+from ce_gym.dynamics.recursion.joint_space import composite_inertia, point_jacobian
+from ce_gym.dynamics.stepping.step import finish_step, finished, first_loads, linearise, solve_system, stacked
 from ce_gym.dynamics.stepping.trace import Given
 from ce_gym.model.mechanism import Mechanism
 
@@ -130,12 +129,16 @@ class Equation:
 
     def implicit(self) -> SX:
         """Return how the equation of motion changes with the acceleration, shape (nv, nv)."""
-        whole = ca.jacobian(self._motion, self.vdot)
-        for i, (at, _, slope) in enumerate(self.local):
-            whole += ca.jacobian(self._pressed, self.forces[:, i]) @ slope @ ca.jacobian(at, self.vdot)
-        return ca.substitute(
-            ca.sparsify(whole), self.stacked_inertias(self.inertia), self.stacked_inertias(self.articulated)
-        )
+        kinematics, dt = self.system.start.kinematics, self.given.dt
+        whole = composite_inertia(self.mechanism, kinematics) + self.system.joints.slope
+        for k, rows in self.turned.items():
+            whole[rows, rows] += self._damped(k, self.articulated[k])[0]
+        for contact, (_, _, slope) in zip(self.system.contacts, self.local, strict=True):
+            J = point_jacobian(self.mechanism, kinematics, contact.body, contact.law.touch.point)
+            if self.layout.floating:
+                J[:, :6] = J[:, :6] @ ca.diagcat(*[next(iter(kinematics.bodies.values())).R] * 2)
+            whole -= J.T @ (dt * slope[:, -GAIN:]) @ J
+        return ca.sparsify(whole)
 
     @cached_property
     def force_values(self) -> SX:
@@ -164,23 +167,25 @@ class Equation:
     @cached_property
     def articulated(self) -> dict[int, SX]:
         """Inertias of clusters on the way of the recursion, without what acts on their joints, shape (d, d) each."""
-        return self.inertias(with_contacts({}, self.system.contacts, self.system.loads.gravity))
+        return self.inertias(self.system.contacts)
 
-    def inertias(self, external: dict[str, BodyTerms]) -> dict[int, SX]:
-        """Return such inertias where something else acts on bodies."""
-        turning = TurningDamping(self.given.state.v, self.given.dt)
-        found = inward_inertia_pass(self.mechanism, self.system.start.kinematics, self.system.joints, external, turning)
-        return {k: found.inertia[k] for k in self.turned}
+    def inertias(self, contacts: list[LinearContact]) -> dict[int, SX]:
+        """Return such inertias where only some contacts act."""
+        loads = replace(self.system.loads, contacts=contacts)
+        articulation = solve_system(replace(self.system, loads=loads)).motion.articulation
+        return {k: articulation.inertia[k] for k in self.turned}  # type: ignore[union-attr]
 
     def local_force(self, contact: LinearContact) -> tuple[SX, SX, SX]:
         """Return the arguments of a contact's force, the force (3,), and its derivative."""
         law, touch, iterate = contact.law, contact.law.touch, contact.iterate
-        names = [f.name for f in fields(touch) if f.name not in ("point", "drift") and getattr(touch, f.name).numel()]
-        symbols = {name: SX.sym(name, *getattr(touch, name).shape) for name in names}
+        values = {f.name: getattr(touch, f.name) for f in fields(touch) if f.name not in ("R", "point", "drift")}
+        values = {name: value for name, value in values.items() if not value.is_constant()}
+        symbols = {name: SX.sym(name, value.nnz()) for name, value in values.items()}
+        changed = {name: SX(value.sparsity(), symbols[name]) for name, value in values.items()}
         before, gain = SX.sym("before", GAIN), SX.sym("gain", GAIN)
-        about = LinearContact(replace(law, touch=replace(touch, **symbols)), replace(iterate, gain=before))
+        about = LinearContact(replace(law, touch=replace(touch, **changed)), replace(iterate, gain=before))
         force, wrt = about.force_after(gain), ca.vertcat(*symbols.values(), before, gain)
-        at = ca.vertcat(*[getattr(touch, name) for name in names], iterate.gain, contact.gain(self.solved.motion))
+        at = ca.vertcat(*map(packed, values.values()), iterate.gain, contact.gain(self.solved.motion))
         force, slope = ca.substitute([force, ca.jacobian(force, wrt)], [wrt], [at])
         return at, force, ca.sparsify(slope)
 
@@ -203,16 +208,23 @@ class Equation:
         kinematics, still = self.system.start.kinematics, SX(6, 1)
         f = dict.fromkeys(self.mechanism.bodies, still)
         for i, contact in enumerate(self.system.contacts):
-            moment = cross(contact.law.touch.point, self.forces[:, i])
-            f[contact.body] = f[contact.body] - ca.vertcat(moment, self.forces[:, i])
+            touch = contact.law.touch
+            force = touch.R.T @ self.forces[:, i]
+            f[contact.body] = f[contact.body] - ca.vertcat(cross(touch.point, force), force)
         return force_on_coordinates(self.mechanism, kinematics, f)
 
     def _damping(self, k: int, inertia: SX) -> SX:
         """Return the torque that damps the joints of a cluster because its carrier turns, shape (d,)."""
-        carrier, rows = self.mechanism.tree.clusters[k].output_body, self.turned[k]
-        turning = TurningDamping(self.given.state.v, self.given.dt)
-        more, drag = turning.on(inertia, rows, self.system.start.kinematics.bodies[carrier].v[:3])  # type: ignore[index]
-        return more @ self.vdot[rows] - drag
+        more, drag = self._damped(k, inertia)
+        return more @ self.vdot[self.turned[k]] - drag
+
+    def _damped(self, k: int, inertia: SX) -> tuple[SX, SX]:
+        """Return what that damping adds to the inertia of a cluster, shape (d, d), and its force, shape (d,)."""
+        carrier, turning = (
+            self.mechanism.tree.clusters[k].output_body,
+            TurningDamping(self.given.state.v, self.given.dt),
+        )
+        return turning.on(inertia, self.turned[k], self.system.start.kinematics.bodies[carrier].v[:3])  # type: ignore[index]
 
     @cached_property
     def _slope(self) -> SX:

@@ -117,7 +117,7 @@ class Linearization(Equation):
         Returns:
             Function (*inputs) -> drift, the derivative of that torque by itself.
         """
-        free = ca.project(self.drift_of(self.inertias({})), self.drift.sparsity())
+        free = ca.project(self.drift_of(self.inertias([])), self.drift.sparsity())
         return traced("drift", self.inputs, {"drift": packed(free)})
 
     def pressed_drift_function(self) -> ca.Function:

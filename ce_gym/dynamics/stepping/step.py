@@ -6,7 +6,7 @@ moment.
 
     start = positions, velocities and memory of the robot
     forces = [law.place(start).linearise(iterate) for law in the scene's laws]      linear in the accelerations
-    vdot = CE-ABA(inertias, forces)         the constraint-embedding articulated-body algorithm
+    vdot = CE-ABA(inertias, forces)         the constraint-embedding articulated-body algorithm, or joint_space.py
     state, iterate = integrate(vdot), and the memory and next iterate of each force
 
 Which contacts act, slip or stick, which motors are at their limits and which joints dry friction holds is an active
@@ -18,7 +18,7 @@ it does not depend on its neighbours.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
@@ -32,6 +32,7 @@ from ce_gym.dynamics.forces.linear import JointForce, Motion, is_moment
 from ce_gym.dynamics.forces.scene import Scene, contact_places
 from ce_gym.dynamics.forces.self_collision import add_pair_forces, solve_pair_forces
 from ce_gym.dynamics.integrators.methods import METHODS
+from ce_gym.dynamics.laws.contacts import with_contacts
 from ce_gym.dynamics.laws.law import ForceLaw, LinearForce, Loads, PlacedForce, Start
 from ce_gym.dynamics.laws.scene_laws import iterate_size, scene_laws
 from ce_gym.dynamics.recursion.ce_aba import (
@@ -42,8 +43,10 @@ from ce_gym.dynamics.recursion.ce_aba import (
     inward_inertia_pass,
     outward_acceleration_pass,
 )
+from ce_gym.dynamics.recursion.ce_rnea import outward_acceleration
 from ce_gym.dynamics.recursion.derived import guessed_coordinates
 from ce_gym.dynamics.recursion.gyroscopic import TurningDamping, steadying_couples
+from ce_gym.dynamics.recursion.joint_space import JointSpace, base_acceleration, has_short_branches
 from ce_gym.dynamics.recursion.kinematics import Kinematics
 from ce_gym.dynamics.state import State
 from ce_gym.dynamics.stepping.broad_phase import any_in_range
@@ -91,7 +94,13 @@ class System:
         slope = ca.diagcat(SX(base, base), balls.slope, joints.slope)
         return JointTerms(ca.vertcat(SX(base, 1), balls.tau, joints.tau), slope)
 
-    def solved(self, vdot: SX, a: dict[str, SX], articulation: Articulation | None = None) -> Solved:
+    def solved(
+        self,
+        vdot: SX,
+        a: dict[str, SX],
+        articulation: Articulation | None = None,
+        gains: Mapping[LinearContact, SX] | None = None,
+    ) -> Solved:
         """Return the system with its acceleration.
 
         Args:
@@ -99,9 +108,10 @@ class System:
             a: Of each body minus gravity, body coordinates, shape (6,) each.
             articulation: Of the recursion that found it, for the loads of rotors and stretches; without it these keep
                 their old values.
+            gains: Change of the velocity of contacts in the step [m/s], shape (3,) each, where it is known otherwise.
         """
         ydd = vdot[self.start.scene.mechanism.robot.layout.joints_v :]
-        return Solved(self, vdot, Motion(ydd, a, self.loads.gravity, articulation))
+        return Solved(self, vdot, Motion(ydd, a, self.loads.gravity, articulation, gains or {}))
 
 
 @dataclass
@@ -197,25 +207,63 @@ def first_loads(start: Start) -> Loads:
     mechanism, n = start.scene.mechanism, start.yd.numel()
     couples = {} if is_moment(start.dt) else steadying_couples(mechanism, start.kinematics, start.dt)
     bodies = {name: BodyTerms(SX(6, 6), ca.vertcat(couple, SX(3, 1))) for name, couple in couples.items()}
-    bodies_in_world = start.kinematics.bodies
-    gravity = {name: bodies_in_world[name].R.T @ gravity_acceleration(mechanism) for name in mechanism.bodies}
     n_balls = 3 * len(mechanism.robot.balls)
     balls = JointForce(SX(n_balls, 1), SX(n_balls, n_balls))
-    return Loads(bodies, balls, JointForce(SX(n, 1), SX(n, n)), gravity)
+    return Loads(bodies, balls, JointForce(SX(n, 1), SX(n, n)), gravity_acceleration(mechanism))
 
 
 def solve(scene: Scene, state: State, target: SX, dt: float, iterate: SX) -> Solved:
-    """Find the acceleration of one robot over a step by CE-ABA; arguments as for `linearise`."""
-    system, mechanism = linearise(scene, state, target, dt, iterate), scene.mechanism
-    kinematics, loads = system.start.kinematics, system.loads
-    turning = None if is_moment(dt) else TurningDamping(state.v, dt)
+    """Find the acceleration of one robot over a step; arguments as for `linearise`."""
+    return solve_system(linearise(scene, state, target, dt, iterate))
+
+
+def solve_system(system: System) -> Solved:
+    """Find the acceleration of a robot over a step by the algorithm that takes less time."""
+    return (solve_in_joint_space if in_joint_space(system) else solve_by_recursion)(system)
+
+
+def in_joint_space(system: System) -> bool:
+    """Whether the equation of motion is solved in joint space: all branches are short, and no force excludes it."""
+    implicit = any(ca.sparsify(terms.inertia).nnz() for terms in system.loads.bodies.values())
+    return has_short_branches(system.start.scene.mechanism) and not implicit
+
+
+def solve_in_joint_space(system: System) -> Solved:
+    """Find the acceleration of a robot over a step by elimination in joint space."""
+    start, loads, mechanism = system.start, system.loads, system.start.scene.mechanism
+    kinematics, dt = start.kinematics, start.dt
+    turning = None if is_moment(dt) else TurningDamping(start.state.v, dt)
+    space = JointSpace.of(mechanism, kinematics, {name: terms.force for name, terms in loads.bodies.items()})
+    touching = [space.jacobian(contact.body, contact.law.touch.point) for contact in loads.contacts]
+    for contact, J in zip(loads.contacts, touching, strict=True):
+        space.add_force(J, contact.force, dt * contact.C, contact.law.near)
+    ends = [[end.jacobian(space.jacobian(end.name, end.point)) for end in pair.law.ends] for pair in loads.pairs]
+    pressing, forces = [first + second for first, second in ends], SX.sym("forces", len(loads.pairs))
+    for i, J in enumerate(pressing):  # the equation is linear in forces of pairs, and is solved for them
+        space.add_force(J, forces[i], SX(1, 1))
+    articulation = space.eliminate(system.joints, turning)
+    if loads.pairs:
+        articulation = solve_pair_forces(mechanism, kinematics, articulation, loads.pairs, forces, False)
+    x = space.acceleration(articulation)
+    gains: dict[LinearContact, SX] = {c: dt * (J @ x) for c, J in zip(loads.contacts, touching, strict=True)}
+    gains |= {pair: ca.vertcat(dt * (J @ x), SX(2, 1)) for pair, J in zip(loads.pairs, pressing, strict=True)}
+    vdot = base_acceleration(mechanism, kinematics, x)
+    a, _ = outward_acceleration(mechanism, kinematics, vdot)
+    return system.solved(vdot, a, articulation, gains)
+
+
+def solve_by_recursion(system: System) -> Solved:
+    """Find the acceleration of a robot over a step by CE-ABA."""
+    start, loads, mechanism = system.start, system.loads, system.start.scene.mechanism
+    kinematics, dt = start.kinematics, start.dt
+    turning = None if is_moment(dt) else TurningDamping(start.state.v, dt)
     forces = SX.sym("forces", len(loads.pairs))  # the recursion is linear in them, and is solved for them
-    external = add_pair_forces(loads.bodies, loads.pairs, forces)
+    external = with_contacts(loads.bodies, loads.contacts, loads.gravity)
+    external = add_pair_forces(external, loads.pairs, forces)
     articulation = inward_inertia_pass(mechanism, kinematics, system.joints, external, turning)
     if loads.pairs:
-        vdot, a = solve_pair_forces(mechanism, kinematics, articulation, loads.pairs, forces)
-    else:
-        vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation)
+        articulation = solve_pair_forces(mechanism, kinematics, articulation, loads.pairs, forces)
+    vdot, a = outward_acceleration_pass(mechanism, kinematics, articulation)
     return system.solved(vdot, a, articulation)
 
 
@@ -284,18 +332,21 @@ def balance_after(solved: Solved, before: Balance | None) -> Balance:
 
 
 def external_wrenches(solved: Solved) -> list[tuple[str, SX]]:
-    """Return mean wrenches on bodies over a step, gravity left out: body, wrench in its axes about its origin, (6,)."""
-    system, motion = solved.system, solved.motion
+    """Return mean wrenches on bodies over a step, gravity left out: body, world wrench about its origin, (6,)."""
+    system, motion, bodies = solved.system, solved.motion, solved.kinematics.bodies
+    wrenches = []
+    for contact in system.contacts:
+        force = where(contact.law.near, contact.force_after(contact.gain(motion)))
+        arm = contact.law.touch.R @ contact.law.touch.point
+        wrenches.append((contact.body, ca.vertcat(cross(arm, force), force)))
     if system.pushed:  # by laws that are no contacts
         start, couples = system.start, {}
         if not is_moment(start.dt):  # between two bodies of the robot
             couples = steadying_couples(start.scene.mechanism, start.kinematics, start.dt)
-        forces = {name: terms.force - terms.inertia @ motion.a[name] for name, terms in system.loads.bodies.items()}
-        return [(name, force - ca.vertcat(couples.get(name, SX(3, 1)), SX(3, 1))) for name, force in forces.items()]
-    wrenches = []
-    for contact in system.contacts:
-        force = where(contact.law.near, contact.force_after(contact.gain(motion)))
-        wrenches.append((contact.body, ca.vertcat(cross(contact.law.touch.point, force), force)))
+        for name, terms in system.loads.bodies.items():
+            wrench, R = terms.force - terms.inertia @ motion.a[name], bodies[name].R
+            moment = wrench[:3] - couples.get(name, SX(3, 1))
+            wrenches.append((name, ca.vertcat(R @ moment, R @ wrench[3:])))
     return wrenches
 
 
