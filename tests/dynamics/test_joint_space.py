@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from ball_joints import with_balls
 from dense import Dense
+from elastic_robots import elastic
 
 from ce_gym.compile import Buffer, Call, Program, load_kernel
 from ce_gym.dynamics import Model
@@ -134,11 +135,9 @@ def test_ball_joints(floating: bool):
 
 
 @pytest.mark.stress
-@pytest.mark.parametrize("level", [*LEVELS, "elastic"])
+@pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("robot_name", robots())
 def test_all_robots(robot_name: str, level: str):
-    if level == "elastic" and not load_robot(robot_name).elastic:
-        pytest.skip("no transmission stretches")
     check_same(Model(robot_name, level), 20)
 
 
@@ -171,6 +170,10 @@ def test_in_single_precision():
 )
 def test_short_branches_are_solved_in_joint_space(robot_name: str, short: bool):
     assert has_short_branches(Model(robot_name).mechanism) == short
+
+
+def test_elastic_transmissions():
+    check_same(Model(elastic(load_robot("mini_cheetah"), 300.0), "elastic"), contacts="foot")
 
 
 def test_pairs_of_links():
