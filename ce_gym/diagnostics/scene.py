@@ -200,9 +200,7 @@ def solver_of(program: TaskProgram) -> str:
     """Return the name of the algorithm that finds the accelerations in a scene."""
     given = Given(program.model.mechanism, program.options)
     system = linearise(given.scene, given.state, given.target, given.dt, first_iterate(given.scene))
-    short = (
-        f"elimination in joint space (no branch has more than {LONGEST_BRANCH} coordinates, those of the base included)"
-    )
+    short = f"elimination in joint space (at most {LONGEST_BRANCH} coordinates in a branch, with the base)"
     return short if in_joint_space(system) else "CE-ABA"
 
 

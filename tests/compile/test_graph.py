@@ -126,6 +126,13 @@ def test_products_with_what_may_be_zero_share_one_choice(evaluate):
     check(function, evaluate)
 
 
+def test_choices_protect_from_numbers_that_are_not_finite(evaluate):
+    part = ca.if_else(X > 0, Z, 0)
+    function, _ = rewritten(part * (1 / X) + part * Y)
+    rows = [np.array(x) for x in ([[0.0], [2.0]], [[1.0], [1.0]], [[1.0], [1.0]])]
+    np.testing.assert_array_equal(evaluate(function, *rows)[0], [[0.0], [1.5]])
+
+
 def test_equal_operations_are_one(evaluate):
     function, ops = rewritten(ca.sin(X * Y + Z), ca.cos(Z + Y * X))
     assert ops == sorted([FMA, ca.OP_SIN, ca.OP_COS])

@@ -19,6 +19,11 @@ REMOVED, SELECT, FMA, FMS, FNMA = -1, -2, -3, -4, -5
 
 COMMUTATIVE = (casadi.OP_ADD, casadi.OP_MUL, casadi.OP_AND, casadi.OP_OR)
 """Operations whose operands can be exchanged."""
+UNBOUNDED = (
+    *(casadi.OP_DIV, casadi.OP_INV, casadi.OP_POW, casadi.OP_CONSTPOW, casadi.OP_SQRT),
+    *(casadi.OP_LOG, casadi.OP_EXP, casadi.OP_TAN, casadi.OP_ACOS, casadi.OP_ASIN),
+)
+"""Operations whose results may be infinite or undefined."""
 NO_OPERATION = (casadi.OP_INPUT, casadi.OP_CONST, casadi.OP_OUTPUT, REMOVED)
 """Nothing is computed for these."""
 
@@ -142,8 +147,10 @@ def _share_choices(graph: Graph) -> None:
     """Rewrite `if_else_zero(c, x y)` as `if_else_zero(c, x) y` where several choices have the same `c` and `x`.
 
     CasADi moves products and signs into choices, which takes one choice for each product and prevents multiply-adds.
+    Where `y` may not be finite, the choice protects from it and stays.
     """
     ops, operands, made = graph.ops, graph.operands, {}
+    unsafe = reached([k for k, op in enumerate(ops) if op in UNBOUNDED], graph.users())
 
     def node(op: int, *of: int) -> int:
         if (op, *of) not in made:
@@ -164,8 +171,8 @@ def _share_choices(graph: Graph) -> None:
         counts = Counter((c, x) for c, factors, _ in products.values() for x in set(factors))
         waiting = False
         for k, (c, factors, negative) in products.items():
-            x, y = sorted(factors, key=lambda factor: -counts[c, factor])
-            if counts[c, x] > 1:
+            x, y = sorted(factors, key=lambda factor: (factor not in unsafe, -counts[c, factor]))
+            if counts[c, x] > 1 and y not in unsafe:
                 choice = node(casadi.OP_IF_ELSE_ZERO, c, x)
                 graph.replace(k, casadi.OP_MUL, node(casadi.OP_NEG, choice) if negative else choice, y)
                 waiting = True
