@@ -243,7 +243,7 @@ class Model:
         arrays = {x: np.asarray(a, dtype=float) for x, a in zip(batched.inputs, arguments, strict=True)}
         are_finite = {x: np.isfinite(array).all(-1) for x, array in arrays.items()}
         if "q" in arrays:
-            self.dependent_guess(np.where(are_finite["q"][..., None], arrays["q"], self.standing_q))
+            self.dependent_guess(np.where(np.expand_dims(are_finite["q"], -1), arrays["q"], self.standing_q))
         name, has_nan = batched.function.name(), np.any([np.isnan(r).any((-2, -1)) for r in results], axis=0)
         is_wrong = has_nan & np.all(np.broadcast_arrays(*are_finite.values()), axis=0)
         if self._has_loops and name != "loops" and is_wrong.any():
