@@ -57,13 +57,12 @@ def usable_cores() -> int:
 def memory() -> float:
     """Return the memory that this process may use [bytes]; inf where the system does not tell."""
     sizes = [float("inf")]
-    if hasattr(os, "sysconf"):
-        sizes.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     with contextlib.suppress(OSError, ValueError):  # "max" is no number
         sizes.append(int(CONTAINER.read_text()))
-    with contextlib.suppress(ImportError):
+    if sys.platform != "win32":
         import resource
 
+        sizes.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
         limit, _ = resource.getrlimit(resource.RLIMIT_AS)
         sizes += [limit] if limit != resource.RLIM_INFINITY else []
     return min(sizes)
