@@ -14,6 +14,7 @@ with its distance from the base, so that this pays for short branches only, see 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -73,22 +74,25 @@ class JointSpace:
         """Return the Jacobian of a point [m] of a body, world axes, shape (3, nv)."""
         return point_jacobian(self.mechanism, self.kinematics, body, point)
 
-    def add_force(self, J: SX, force: SX, slope: SX, near: SX | None = None) -> None:
+    def add_force(self, J: SX, force: SX, slope: SX) -> None:
         """Add the generalised force `J^T (force - slope J x)`, in place.
 
         Args:
             J: Jacobian of the motion that the force does work on, shape (n, nv).
             force: At `x = 0` [N], shape (n,).
             slope: Symmetric [kg], shape (n, n).
-            near: Whether the force acts; None if it always does.
         """
         columns = [i for i in range(J.shape[1]) if J[:, i].nnz()]
         J_point = J[:, columns]
         H = mirrored(ca.mac(J_point.T, slope @ J_point, ca.densify(self.H[columns, columns])))
-        p = ca.mac(J_point.T, -force, self.p[columns])
-        if near is not None:
-            H, p = (ca.if_else(near, x, old) for x, old in ((H, self.H[columns, columns]), (p, self.p[columns])))
-        self.H[columns, columns], self.p[columns] = H, p
+        self.H[columns, columns], self.p[columns] = H, ca.mac(J_point.T, -force, self.p[columns])
+
+    def add_where(self, acts: SX, forces: Sequence[tuple[SX, SX, SX]]) -> None:
+        """Add forces where they act, in place; each as for `add_force`."""
+        H, p = SX(*self.H.shape), SX(*self.p.shape)
+        for J, force, slope in forces:
+            H, p = H + mirrored(J.T @ (slope @ J)), p - J.T @ force
+        self.H, self.p = mirrored(self.H + ca.if_else(acts, H, 0)), self.p + ca.if_else(acts, p, 0)
 
     def eliminate(self, joints: JointTerms, turning: TurningDamping | None) -> Articulation:
         """Eliminate the clusters from the tips to the base.

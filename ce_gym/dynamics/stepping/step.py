@@ -235,8 +235,15 @@ def solve_in_joint_space(system: System) -> Solved:
     turning = None if is_moment(dt) else TurningDamping(start.state.v, dt)
     space = JointSpace.of(mechanism, kinematics, {name: terms.force for name, terms in loads.bodies.items()})
     touching = [space.jacobian(contact.body, contact.law.touch.point) for contact in loads.contacts]
+    culled: dict[int, tuple[SX, list[tuple[SX, SX, SX]]]] = {}
     for contact, J in zip(loads.contacts, touching, strict=True):
-        space.add_force(J, contact.force, dt * contact.C, contact.law.near)
+        force = J, contact.force, dt * contact.C
+        if contact.law.near is None:
+            space.add_force(*force)
+        else:
+            culled.setdefault(id(contact.law.near), (contact.law.near, []))[1].append(force)
+    for near, group in culled.values():
+        space.add_where(near, group)
     ends = [[end.jacobian(space.jacobian(end.name, end.point)) for end in pair.law.ends] for pair in loads.pairs]
     pressing, forces = [first + second for first, second in ends], SX.sym("forces", len(loads.pairs))
     for i, J in enumerate(pressing):  # the equation is linear in forces of pairs, and is solved for them

@@ -220,7 +220,7 @@ class Given:
     def guarded(self, stepped: Stepped) -> dict[str, SX]:
         """State after the step, or as it was if the robot has diverged now or before."""
         after = stepped.state
-        size = ca.sumsqr(after.v) + ca.sumsqr(after["anchor"])
+        size = ca.sumsqr(ca.vertcat(after.v, after["anchor"]))
         sane = ca.logic_and(size < SANE_SPEED**2, self.diverged < 0.5)  # false for NaN
         sane = ca.logic_and(sane, ca.sumsqr(after.q) < SANE_DISTANCE**2)  # not all positions act on velocities
         if any(closures(self.mechanism)):
