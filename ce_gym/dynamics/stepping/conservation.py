@@ -71,7 +71,8 @@ class Balance:
         momentum = momentum_of(mechanism, kinematics)
         if not mechanism.robot.floating:
             energy = momentum.energy + potential_energy(mechanism, kinematics)
-            return Balance(*[SX(0, 1)] * 3, energy, SX(0))
+            none = SX(0, 1)
+            return Balance(none, none, none, energy, SX(0))
         composite, base = composite_of(mechanism, kinematics), base_of(mechanism, kinematics)
         energy = momentum.energy - ca.sumsqr(momentum.linear) / (2 * composite.mass)
         angular, center = momentum.about(composite.center), base.point_position(composite.center)
