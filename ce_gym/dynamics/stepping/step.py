@@ -178,7 +178,8 @@ def linearise(scene: Scene, state: State, target: SX, dt: float, iterate: SX) ->
     for force in forces:
         before = dict(loads.bodies)
         force.add_to(loads)
-        pushed = pushed or (loads.bodies != before and not force.contacts)
+        changed = any(terms is not before.get(name) for name, terms in loads.bodies.items())
+        pushed = pushed or (changed and not force.contacts)
     return System(start, laws, forces, loads, near, pushed)
 
 
