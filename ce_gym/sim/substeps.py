@@ -112,7 +112,9 @@ def substeps(
     options, plan = replace(options, dt=None), METHODS[options.method]
     step = StepVariables(mechanism, options, outputs)
     if step.stages:
-        function = iteration_function(mechanism, options, step.evaluated, False, has_broad_phase(options), False)
+        function = iteration_function(
+            mechanism, options, step.evaluated, chooses=has_broad_phase(options), conserves=False
+        )
     else:
         function = step_function(mechanism, options, step.evaluated)
     computed = (*ITERATES, BALANCE, "ground", "region_points")

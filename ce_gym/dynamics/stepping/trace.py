@@ -33,7 +33,7 @@ SINGULAR = 1e-3
 SANE_SPEED = 1e4
 """A robot any of whose velocities is beyond this, or NaN, has diverged [rad/s or m/s]."""
 NEAR = "near"
-"""Name of the buffer that says whether something is that is seldom near."""
+"""Name of the buffer that is 1 if a contact that is seldom near is in range."""
 SANE_DISTANCE = 1e6
 """A robot any of whose positions is beyond this, or NaN, has diverged [rad or m]."""
 
