@@ -1,8 +1,9 @@
 """Momentum, kinetic energy and mass distribution of a mechanism, collected from the tips to the root.
 
-An eliminated rotor with the inertia J about its axis u and the speed thd, on a carrier that turns at w, has the angular
-momentum `J thd u` and the energy `J thd^2 / 2 + J thd u^T w` beyond what the inertia of the carrier contains, and terms
-of its transverse inertia, see rotors.py. Levels without these terms in their equations of motion leave them out here.
+An eliminated rotor has the inertia J about its axis u and the speed thd, on a carrier that turns at w. It adds the
+angular momentum `J thd u` and the energy `J thd^2 / 2 + J thd u^T w` to those from the inertia of the carrier. Its
+transverse inertia adds further terms, see rotors.py. A level without these terms in its equations of motion has none
+of them here.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ TINY = 1e-12
 
 @dataclass
 class Balance:
-    """What a robot must have after a step: momentum, and energy if nothing touches it.
+    """Momentum of a robot at the end of a step, and its energy if nothing touches it.
 
     Attributes:
         angular: Angular momentum about the centre of mass, world axes [kg m^2/s], shape (3,); (0,) on a fixed base.
@@ -133,12 +133,12 @@ def mass_of(mechanism: Mechanism) -> SX:
 
 
 def conserving_velocity(mechanism: Mechanism, q: SX, v: SX, guess: SX, balance: Balance) -> tuple[SX, SX, Balance]:
-    """Return positions and velocities that have a given momentum and, in flight, a given energy; and what they have.
+    """Return positions and velocities with a given momentum and, in flight, a given energy; and their own balance.
 
     Args:
         mechanism: The robot.
         q: Positions, shape (nq,). Only the orientation of a robot without joints changes, to have the energy.
-        v: Velocities, shape (nv,); those of the base are ignored, those of the joints are scaled to have the energy.
+        v: Velocities, shape (nv,): base velocities are ignored, joint velocities are scaled to have the energy.
         guess: Dependent coordinates, see `outward_velocity_pass`.
         balance: Momentum and energy.
     """
@@ -167,9 +167,10 @@ def conserving_velocity(mechanism: Mechanism, q: SX, v: SX, guess: SX, balance: 
 def _turned_body(q: SX, composite: Composite, angular: SX, balance: Balance) -> tuple[SX, SX, Balance]:
     """Return what `conserving_velocity` returns, for one rigid body.
 
-    The energy of a body depends on the direction of its angular momentum M in its axes. Energies `M^T I^-1 M / 2` along
-    `M + t d`, scaled to the length of M, with d the part of the angular velocity across M, are those of a quadratic
-    equation in t; the body is turned by the smallest rotation that takes the one direction to the other.
+    The energy of a body depends on the direction of its angular momentum M in its axes. The directions
+    tried are `M + t d`, scaled to the length of M, where d is the part of the angular velocity across M. The energy
+    `M^T I^-1 M / 2` then gives a quadratic equation in t. The body is turned by the smallest rotation between the two
+    directions.
 
     Args:
         q: Position and orientation, shape (7,).

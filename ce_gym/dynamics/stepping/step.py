@@ -359,7 +359,7 @@ def external_wrenches(solved: Solved) -> list[tuple[str, SX]]:
 
 
 def conserved(mechanism: Mechanism, state: State, balance: Balance) -> State:
-    """Return a state with the velocities, and for a single body the orientation, that a balance asks for."""
+    """Return a state with the velocities, and for a single body the orientation, that satisfy a balance."""
     q, v, _ = conserving_velocity(mechanism, state.q, state.v, state.dependent, balance)
     return state.replaced(q=q, v=v)
 
