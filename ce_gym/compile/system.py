@@ -60,11 +60,12 @@ def memory() -> float:
     with contextlib.suppress(OSError, ValueError):  # "max" is no number
         sizes.append(int(CONTAINER.read_text()))
     if sys.platform != "win32":
-        import resource
-
         sizes.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-        sizes += [limit] if limit != resource.RLIM_INFINITY else []
+        with contextlib.suppress(ImportError):
+            import resource
+
+            limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+            sizes += [limit] if limit != resource.RLIM_INFINITY else []
     return min(sizes)
 
 

@@ -118,7 +118,7 @@ class Simulator:
         given = options if dt is None else {"dt": dt, **options}
         self.scene = SceneOptions(**(scene or SceneOptions()).shared | given)
         self.options = resolve_scene(self.scene, model, terrain, control, parameters, material)
-        defaults = parameter_defaults(model.robot, self.options.material, self.options.parameters)
+        defaults = parameter_defaults(model.robot, self.options.material, parameters)
         check_effects(model.mechanism, self.options)
         self._device = device_named(device)
         self.device = self._device.name

@@ -43,11 +43,11 @@ def test_where_links_may_touch_motion_is_the_same():
     assert np.abs(moved[0]).max() > 1.0
 
 
-def test_an_iteration_costs_a_sixth_more_than_at_exact():
+def test_an_iteration_costs_at_most_a_fifth_more_than_at_exact():
     """Instruction counts are deterministic; twelve drives with backlash on four feet."""
     robot = Model("mini_cheetah").robot
     options = StepOptions(contacts=tuple(c.name for c in robot.contacts if c.group == "foot"), dt=None)
     exact, stretching = (
         iteration_function(Model(robot, level).mechanism, options).n_instructions() for level in ("exact", "elastic")
     )
-    assert stretching <= 1.16 * exact
+    assert stretching <= 1.18 * exact

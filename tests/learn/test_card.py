@@ -136,7 +136,10 @@ def test_what_is_not_there_is_told_with_what_is(shelf, run, tmp_path):
     assert locate_policy(tmp_path / "copy") == tmp_path / "copy" / "policy.npz"
     (shelf / "dog_walk_none").mkdir(parents=True)
     (shelf / "dog_walk_none" / "policy.npz").touch()
-    for name in ("cat_walk", str(tmp_path)):
-        with pytest.raises(PolicyError, match=r"no such policy; expected .* \(there are: dog_walk_none\)") as caught:
+    for name, hint in (
+        ("cat_walk", "`python -m ce_gym list`"),
+        (str(tmp_path), "a run in this folder, such as .*copy"),
+    ):
+        with pytest.raises(PolicyError, match=f"no such policy; expected .*{hint}") as caught:
             locate_policy(name)
         assert "\n" not in str(caught.value)
