@@ -27,10 +27,13 @@ class Device(Protocol):
     Attributes:
         name: "cpu", "cuda", "cuda:1" and so on.
         fuses: Whether consecutive stages are one kernel.
+        joint_space: Whether robots with short branches are solved in joint space, see `Scene`. On a GPU its values
+            exceed the registers.
     """
 
     name: str
     fuses: bool
+    joint_space: bool
 
     def tiles(self, num_envs: int, size: int, dtype: str) -> Array:
         """Return zeros in tiles, `size` values of each robot."""
@@ -70,10 +73,17 @@ class Device(Protocol):
 
 
 class Cpu:
-    """numpy arrays and the kernels of `ce_gym.compile`, one stage each."""
+    """numpy arrays and the kernels of `ce_gym.compile`, one stage each.
+
+    Args:
+        joint_space: See `Device`; False computes the same bits as a GPU.
+    """
 
     name, fuses = "cpu", False
     tiles = staticmethod(host_tiles.tiles)
+
+    def __init__(self, joint_space: bool = True) -> None:
+        self.joint_space = joint_space
 
     def zeros(self, shape: tuple[int, ...], dtype: str) -> NDArray:
         return np.zeros(shape, dtype)
@@ -114,7 +124,7 @@ class Cuda:
         CudaUnavailable: If there is no such GPU, or a package is missing; one line.
     """
 
-    fuses = True
+    fuses, joint_space = True, False
 
     def __init__(self, gpu: int = 0) -> None:
         from ce_gym.compile.cuda.gpu import architecture

@@ -74,9 +74,10 @@ def load_step_kernel(
         device: Device of the kernel; the CPU if None.
         controlled: Whether each sub-step begins with a call of a controller, see `CONTROLLER`.
     """
+    device = device or Cpu()
 
     def build() -> tuple[Program]:
-        sizes, further, steps = substeps(model.mechanism, options, outputs)
+        sizes, further, steps = substeps(model.mechanism, options, outputs, device.joint_space)
         joints = sizes.pop("target", 0)
         buffers = [Buffer(name, size, "tiles") for name, size in sizes.items()]
         buffers += [Buffer(COMMAND if controlled else "target", joints, "rows_in")] if joints else []
@@ -85,8 +86,8 @@ def load_step_kernel(
             steps = _controlled(steps, joints)
         return (Program(f"{model.robot.name} {model.transmission} step", tuple(buffers + further), steps),)
 
-    key = f"step {model_key(model)} {options!r} {laws_key(model.mechanism, options)} {outputs!r} {controlled}"
-    return (device or Cpu()).kernel(key, build, dtype)
+    scene = f"{model_key(model)} {options!r} {laws_key(model.mechanism, options)}"
+    return device.kernel(f"step {scene} {outputs!r} {controlled} {device.joint_space}", build, dtype)
 
 
 def _controlled(steps: tuple[Step | Repeat, ...], size: int) -> tuple[Repeat]:
@@ -100,9 +101,15 @@ def _controlled(steps: tuple[Step | Repeat, ...], size: int) -> tuple[Repeat]:
 
 
 def substeps(
-    mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...]
+    mechanism: Mechanism, options: StepOptions, outputs: tuple[str, ...], joint_space: bool = True
 ) -> tuple[dict[str, int], list[Buffer], tuple[Step | Repeat, ...]]:
     """Return the part of a program that advances a robot by `n_substeps` sub-steps.
+
+    Args:
+        mechanism: The robot at a transmission level.
+        options: The scene.
+        outputs: Quantities to compute besides the state.
+        joint_space: See `Scene`.
 
     Returns:
         Sizes of the buffers that the program must provide: state, `diverged`, `retries`, inputs of `step_function` with
@@ -112,7 +119,9 @@ def substeps(
     options, plan = replace(options, dt=None), METHODS[options.method]
     step = StepVariables(mechanism, options, outputs)
     if step.stages:
-        function = iteration_function(mechanism, options, step.evaluated, culls=True, conserves=False)
+        function = iteration_function(
+            mechanism, options, step.evaluated, culls=True, conserves=False, joint_space=joint_space
+        )
     else:
         function = step_function(mechanism, options, step.evaluated)
     culled = [name for name in function.name_in() if name.startswith(NEAR_ITERATE)]

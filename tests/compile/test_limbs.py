@@ -129,7 +129,7 @@ class Uncompiled(Emulated):
         return self
 
 
-@pytest.mark.parametrize(("dtype", "spills", "size"), [("float32", 700, 96), ("float64", 3500, 148)])
+@pytest.mark.parametrize(("dtype", "spills", "size"), [("float32", 200, 80), ("float64", 1700, 120)])
 def test_a_quadruped_fits_into_registers(dtype, spills, size):
     try:
         nvrtc.compiler_version()

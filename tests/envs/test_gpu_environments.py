@@ -11,7 +11,7 @@ from ce_gym.compile.cuda.host import host_compiler
 from ce_gym.compile.cuda.source import emit_source
 from ce_gym.envs.runtime.batch import programs
 from ce_gym.envs.runtime.setup import make_program
-from ce_gym.sim.devices import Emulated
+from ce_gym.sim.devices import Cpu, Emulated
 
 ID = "ce_gym/MiniCheetahVelocity-v0"
 N, STEPS = 21, 12
@@ -30,7 +30,7 @@ def numbers(value):
 def run_both(device, steps=STEPS, **options):
     """Step both kinds with the same seeds and actions: all that they return is the same, bit for bit, or at least
     equal (zeros may differ in sign). Returns them and who ended."""
-    pair = make("cpu", **options), make(device, **options)
+    pair = make(Cpu(joint_space=False), **options), make(device, **options)
     rng, ended = np.random.default_rng(0), 0
     first = [envs.reset(seed=5)[0] for envs in pair]
     for envs in pair:
@@ -153,7 +153,7 @@ def test_a_whole_environment_compiles_for_a_gpu():
         nvrtc.compiler_version()
     except CudaUnavailable as problem:
         pytest.skip(f"not compiled for a GPU: {problem}")
-    source = emit_source(programs(make_program("mini_cheetah", "velocity"), fused=True), "float32")
+    source = emit_source(programs(make_program("mini_cheetah", "velocity"), Emulated()), "float32")
     _, usage = nvrtc.compile_cubin(source.text, "sm_90")
     assert 128 < usage.registers <= 255
     assert usage.spill_loads < 8000

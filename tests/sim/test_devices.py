@@ -7,7 +7,7 @@ from tripod import TRIPOD
 
 import ce_gym
 from ce_gym.compile.cuda.host import host_compiler
-from ce_gym.sim.devices import Emulated, device_named, to_numpy
+from ce_gym.sim.devices import Cpu, Emulated, device_named, to_numpy
 
 N = 20
 DTYPES = pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -42,7 +42,7 @@ def assert_same(one, other):
 )
 def test_the_same_numbers(robot, dtype):
     model = ce_gym.Model(robot)
-    assert_same(*(stepped(model, dtype, device) for device in ("cpu", Emulated())))
+    assert_same(*(stepped(model, dtype, device) for device in (Cpu(joint_space=False), Emulated())))
 
 
 @needs_host_compiler
@@ -57,7 +57,7 @@ def test_everything_of_a_simulator():
         "contacts": "foot",
     }
     rng = np.random.default_rng(1)
-    sims = [ce_gym.Simulator(model, N, device=device, **options) for device in ("cpu", Emulated())]
+    sims = [ce_gym.Simulator(model, N, device=device, **options) for device in (Cpu(joint_space=False), Emulated())]
     mask, friction = rng.random(N) > 0.5, rng.uniform(0.2, 1.0, (N, 1))
     targets = model.standing_q[7:] + rng.uniform(-0.3, 0.3, (6, N, 2))
     for sim, kind in zip(sims, (np.asarray, torch.from_numpy), strict=True):
@@ -83,7 +83,7 @@ def test_everything_of_a_simulator():
 def test_a_method_of_several_steps_agrees():
     model = ce_gym.Model(TRIPOD)
     options = {"method": "extrapolated", "contacts": "foot", "outputs": ("error",)}
-    assert_same(*(stepped(model, "float64", device, **options) for device in ("cpu", Emulated())))
+    assert_same(*(stepped(model, "float64", device, **options) for device in (Cpu(joint_space=False), Emulated())))
 
 
 @needs_host_compiler
@@ -91,7 +91,7 @@ def test_steps_in_parts_agree():
     """Robots of one tile need one part, two and many; a thread of a GPU has one robot."""
     model, found = ce_gym.Model("planar_leg_linkage"), []
     v = np.linspace(0.0, 400.0, N)[:, None] * np.ones(model.nv)
-    for device in ("cpu", Emulated()):
+    for device in (Cpu(joint_space=False), Emulated()):
         sim = ce_gym.Simulator(model, N, device=device)
         sim.set_state(np.tile(model.standing_q, (N, 1)), v)
         sim.step(model.standing_q, 3)
@@ -103,7 +103,7 @@ def test_steps_in_parts_agree():
 @needs_host_compiler
 def test_a_diverged_robot_is_frozen_and_flagged():
     model = ce_gym.Model(TRIPOD)
-    for device in ("cpu", Emulated()):
+    for device in (Cpu(joint_space=False), Emulated()):
         sim = ce_gym.Simulator(model, 4, device=device)
         v = np.zeros((4, model.nv))
         v[2, 0] = 1e6
@@ -131,4 +131,4 @@ def test_without_a_gpu_one_line_says_so():
 @DTYPES
 def test_a_gpu_gives_the_same_numbers(dtype):
     model = ce_gym.Model("mini_cheetah")
-    assert_same(*(stepped(model, dtype, device) for device in ("cpu", "cuda")))
+    assert_same(*(stepped(model, dtype, device) for device in (Cpu(joint_space=False), "cuda")))

@@ -11,7 +11,7 @@ from ce_gym.bench.measure.report import Cell, Report, Requirement, Table
 from ce_gym.console import progress
 from ce_gym.dynamics.model import Model
 from ce_gym.sim import Simulator
-from ce_gym.sim.devices import Device, to_numpy
+from ce_gym.sim.devices import Cpu, Device, to_numpy
 
 BOUND = {"float64": 1e-11, "float32": 1e-5}
 """Largest allowed difference, relative to a robot's largest position or velocity, or to 1."""
@@ -64,7 +64,7 @@ def measure(
         for level in levels:
             model = Model(name, level)
             for dtype in BOUND:
-                apart = difference(*(stepped(model, dtype, one, num_envs) for one in ("cpu", device)))
+                apart = difference(*(stepped(model, dtype, one, num_envs) for one in (Cpu(joint_space=False), device)))
                 rows.append((name, level, dtype, float(apart.max()), 100 * float((apart == 0).mean())))
                 worst[dtype] = max(worst[dtype], float(apart.max()))
     columns = ("robot", "level", "dtype", "largest difference", "robots with the same numbers [%]")

@@ -154,7 +154,7 @@ def _resources(robot: str) -> Table:
     for dtype in DTYPES:
         caught = _Stages()
         Simulator(Model(robot), device=caught, dtype=dtype, contacts="foot", outputs=())
-        sources = {"sub-steps": caught.source, "environment step": emit_source(programs(program, fused=True), dtype)}
+        sources = {"sub-steps": caught.source, "environment step": emit_source(programs(program, caught), dtype)}
         for name, source in sources.items():
             for arch in ARCHITECTURES:
                 start = time.perf_counter()

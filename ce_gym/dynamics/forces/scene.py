@@ -136,6 +136,8 @@ class Scene:
         looked_up: Where the contact centres were when the ground was looked up, x and y [m], shape (2, n_touches);
             empty if that is where they are.
         culls: Whether contacts of a culled group act only while one of them is near; else all contacts always act.
+        joint_space: Whether robots with short branches are solved in joint space; else all by CE-ABA, which takes more
+            operations but keeps fewer values at a time.
     """
 
     mechanism: Mechanism
@@ -145,6 +147,7 @@ class Scene:
     region_points: SX = field(default_factory=lambda: SX(3, 0))
     looked_up: SX = field(default_factory=SX)
     culls: bool = False
+    joint_space: bool = True
 
 
 def target_names(mechanism: Mechanism, control: Control) -> tuple[str, ...]:

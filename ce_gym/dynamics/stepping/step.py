@@ -225,9 +225,9 @@ def solve_system(system: System) -> Solved:
 
 def in_joint_space(system: System) -> bool:
     """Whether the equation of motion is solved in joint space: all branches are short, and no force excludes it."""
-    implicit = any(ca.sparsify(terms.inertia).nnz() for terms in system.loads.bodies.values())
+    scene, implicit = system.start.scene, any(ca.sparsify(t.inertia).nnz() for t in system.loads.bodies.values())
     only_rotors = not system.start.kinematics.bodies
-    return has_short_branches(system.start.scene.mechanism) and not implicit and not only_rotors
+    return scene.joint_space and has_short_branches(scene.mechanism) and not implicit and not only_rotors
 
 
 def solve_in_joint_space(system: System) -> Solved:

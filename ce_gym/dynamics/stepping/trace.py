@@ -68,6 +68,7 @@ def iteration_function(
     follows: bool = False,
     culls: bool = False,
     conserves: bool = True,
+    joint_space: bool = True,
 ) -> ca.Function:
     """Trace one iteration of an Euler step: repeated on its own iterate until it has converged, it makes the step.
 
@@ -80,6 +81,7 @@ def iteration_function(
             group is then 1 if one is in range, else 0, and `NEAR_ITERATE` holds the group's part of the iterate.
         conserves: Whether the velocities have their momentum and energy; if not, the output `BALANCE` is for
             `conserve_function`.
+        joint_space: See `Scene`.
 
     Returns:
         Function (*state, diverged, *given, iterate) -> (*state, diverged, iterate, unconverged, *outputs), see
@@ -93,7 +95,7 @@ def iteration_function(
     parts, iterate = {name: SX.sym(name, len(of)) for name, of in rows.items()}, SX(size, 1)
     for name, part in parts.items():
         iterate[rows[name]] = part
-    given.scene = replace(given.scene, culls=culls)
+    given.scene = replace(given.scene, culls=culls, joint_space=joint_space)
     symbol = SX.sym(BALANCE, 0 if conserves else balance_size(mechanism))
     balance = None if conserves else Balance.from_column(symbol)
     stepped = iteration(given.scene, given.state, given.target, given.dt, iterate, balance)

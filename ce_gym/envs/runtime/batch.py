@@ -81,9 +81,9 @@ class TaskBatch(Batch):
     ) -> None:
         super().__init__(program.schema.values(), num_envs, dtype, device, program.field, num_threads)
         self.program, self.fused = program, device.fuses
-        key = kernel_key(program)
+        key = f"{kernel_key(program)} {device.joint_space}"
         kind = "fused step" if self.fused else "environment"
-        self._step_kernel = device.kernel(f"{kind} {key}", lambda: programs(program, self.fused), dtype)
+        self._step_kernel = device.kernel(f"{kind} {key}", lambda: programs(program, device), dtype)
         self._reset_kernel = device.kernel(f"reset {key}", lambda: (program.reset_program(),), dtype)
         ended = device.zeros((num_envs, 1 + len(program.sum_names)), "float64")
         self._persistent = {name: self.arrays[name] for name in program.state_sizes} | self.tables | {"ended": ended}
@@ -175,9 +175,10 @@ class TaskBatch(Batch):
         kernel(self._persistent | arrays, self.num_envs, repeats=repeats, num_threads=self.num_threads, **self._streams)
 
 
-def programs(program: TaskProgram, fused: bool) -> tuple[Program, ...]:
+def programs(program: TaskProgram, device: Device) -> tuple[Program, ...]:
     """Return the programs of one launch of a control step."""
-    return (program.step_program(fused), program.reset_program()) if fused else (program.step_program(),)
+    step = program.step_program(device.fuses, device.joint_space)
+    return (step, program.reset_program()) if device.fuses else (step,)
 
 
 def kernel_key(program: TaskProgram) -> str:

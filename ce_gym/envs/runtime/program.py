@@ -104,17 +104,18 @@ class TaskProgram(TaskSpec):
         """Length of the critic's observation, the policy's blocks included; 0 if the task has no critic blocks."""
         return sum(self.stages.block_sizes.values()) if self.task.critic else 0
 
-    def step_program(self, fused: bool = False) -> Program:
+    def step_program(self, fused: bool = False, joint_space: bool = True) -> Program:
         """Return act, physics and evaluate as one program.
 
         Args:
-            fused: Whether robots that are done are reset in the same launch. `final_observation` then keeps the
-                observation before the reset.
+            fused: Whether robots that are done are reset in the same launch, as on a GPU. `final_observation` then
+                keeps the observation before the reset.
+            joint_space: See `Device`.
         """
         evaluate, n_draws = self.stages.evaluate()
         act, size = self.actions.act("delay" in self.schema), self.observation_size + self.critic_size
         outputs = tuple(name for name in ("torque", "motor_torque", "contact_forces") if name in self.schema)
-        _, scratch, physics = substeps(self.model.mechanism, self.options, outputs)
+        _, scratch, physics = substeps(self.model.mechanism, self.options, outputs, joint_space)
         buffers = [
             Buffer("action_in", self.n_actions, "rows_in", "float32"),
             Buffer("clipped", self.n_actions, "scratch"),
