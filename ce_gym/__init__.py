@@ -1,6 +1,7 @@
 """Gymnasium environments for legged robots whose physics keeps rotors, gears and belts.
 
     import gymnasium, ce_gym
+    gymnasium.register_envs(ce_gym)
     env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0")
 
 `load_robot` reads a robot, `Model` is its dynamics at a transmission level, `Simulator` steps thousands of copies,
@@ -12,7 +13,7 @@ from ce_gym.diagnostics.scene import scene_report
 from ce_gym.dynamics.forces.scene import SceneOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.custom import register_robot
-from ce_gym.envs.registration import environment_ids, register_environments
+from ce_gym.envs.registration import environment_ids, explain_levels, register_environments
 from ce_gym.envs.rendering import use_renderers
 from ce_gym.envs.terms.registry import metric, observation, reward, termination
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
@@ -53,4 +54,5 @@ __all__ = [
 ]
 
 register_environments()
+explain_levels()
 use_renderers("ce_gym.viewer.renderers")

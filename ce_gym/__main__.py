@@ -165,7 +165,7 @@ def _list(args: argparse.Namespace) -> int:
 
     names = [name for name in environment_ids() if name.count("-") == 1]
     print(f"Robots:\n{robot_table()}\n")
-    print("Environments, each also at one level: -Exact (the default), -Coupled, -Armature or -None before -v0:")
+    print('Environments; "-Armature" before "-v0" has that level, and `transmission` selects others:')
     print("\n".join(f"  {name}" for name in names))
     print(f"\nMotors, for `use` in robot files; figures at the rotor:\n{motor_table()}")
     print("\nPolicies, for `play`:")

@@ -13,14 +13,16 @@ import os
 import re
 from pathlib import Path
 
-from ce_gym.envs.registration import ids_of, register
+from ce_gym.envs.registration import ids_of, register, reward_threshold
+from ce_gym.envs.runtime.setup import own_task
+from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, invalid_value
 from ce_gym.model.load import load_robot
 
 
 def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tuple[str, ...]:
-    """Register every task at every transmission level for a robot. Repeated calls have no effect.
+    """Register every task of the package for a robot. Repeated calls have no effect.
 
     Args:
         path: A robot file that `load_robot` reads: .yaml, .urdf (a plain URDF needs its YAML file for contacts and
@@ -28,14 +30,14 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
         name: Start of the ids; by default the name of the robot, `my_robot` as `MyRobot`.
 
     Returns:
-        The ids: `ce_gym/<Name><Task>-v0` for the exact level, and `ce_gym/<Name><Task>-<Level>-v0`.
+        The ids: `ce_gym/<Name><Task>-v0` and `ce_gym/<Name><Task>-Armature-v0`.
 
     Raises:
         RobotError: The file is not valid, the robot does not fit the tasks, or another robot has the ids.
 
     Examples:
         >>> ids = ce_gym.register_robot(ce_gym.load_robot("tello").source, name="my_robot")
-        >>> print(ids[0], ids[3])
+        >>> print(ids[0], ids[1])
         ce_gym/MyRobotVelocity-v0 ce_gym/MyRobotVelocity-Armature-v0
     """
     if not isinstance(path, str | os.PathLike):
@@ -46,8 +48,11 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
     robot = load_robot(file)
     if problems := missing(robot):
         raise problems[0]
-    ids = ids_of(id_stem(robot, name), str(file), bool(robot.elastic))
-    register(ids)
+    tasks = {task: own_task(robot, task) for task in TASKS}
+    ids = ids_of(id_stem(robot, name), str(file), tasks)
+    for env_id, arguments in ids.items():
+        task = arguments["task"]
+        register(env_id, arguments, tasks[task], reward_threshold(task, "gait" in tasks[task].rewards))
     return tuple(ids)
 
 

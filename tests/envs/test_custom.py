@@ -13,7 +13,6 @@ from ce_gym.envs.custom import register_robot
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.task.tasks import TASKS
 from ce_gym.model import RobotError, assets_folder
-from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
@@ -44,9 +43,9 @@ def registry():
     gymnasium.registry.update(before)
 
 
-def test_every_task_at_every_level_has_an_id(dog):
+def test_every_task_has_an_exact_and_a_simplified_id(dog):
     ids = register_robot(dog())
-    assert len(set(ids)) == len(TASKS) * len((None, *LEVELS, ELASTIC))
+    assert len(set(ids)) == len(TASKS) * 2
     assert set(ids) >= {"ce_gym/MyDogVelocity-v0", "ce_gym/MyDogVelocity-Armature-v0"}
     assert all(env_id in gymnasium.registry for env_id in ids)
     assert Path(gymnasium.spec(ids[0]).kwargs["robot"]).is_absolute(), "it works from any folder"
@@ -56,12 +55,19 @@ def test_the_environment_is_that_robot_s(dog):
     path = dog(("height: ", "height: 0.31 #"))
     ids = register_robot(path, name="flat dog")
     assert ids[0] == "ce_gym/FlatDogVelocity-v0"
-    env = gymnasium.make("ce_gym/FlatDogVelocity-None-v0")
+    env = gymnasium.make("ce_gym/FlatDogVelocity-v0", transmission="none")
     observation, _ = env.reset(seed=0)
     assert observation in env.observation_space
     *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert not info.get("diverged", False)
     env.close()
+
+
+def test_limits_follow_the_file(dog):
+    ids = register_robot(dog(("\ntasks:", "\ntasks:\n  velocity: {episode_length: 300, rewards: {gait: 0.5}}")))
+    spec, other = gymnasium.spec(ids[0]), gymnasium.spec("ce_gym/MiniCheetahVelocity-v0")
+    assert (spec.max_episode_steps, other.max_episode_steps) == (300, 1000)
+    assert spec.reward_threshold == 2 * other.reward_threshold
 
 
 def test_twice_is_once_but_another_robot_needs_another_name(dog):
