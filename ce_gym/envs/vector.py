@@ -113,7 +113,7 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         batch, mask = self.batch, self._reset_mask(options)
         keys, to_seed = None if seed is None else self._keys(seed), mask
         with self._exclusive():
-            VectorEnv.reset(self, seed=None if seed is None or hasattr(seed, "__len__") else int(seed))
+            VectorEnv.reset(self, seed=int(seed) if isinstance(seed, int | np.integer) else None)
             if keys is None and (to_seed := mask & ~batch.arrays["seeded"]).any():
                 keys = self.np_random.integers(2**63, size=self.num_envs)
             if keys is not None:

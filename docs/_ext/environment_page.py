@@ -85,7 +85,8 @@ def title(robot: str) -> str:
 def _facts(program: TaskProgram, robot: str, name: str) -> list[tuple[str, str]]:
     n, m, bound = program.n_actions, program.observation_size, OBSERVATION_BOUND
     task, step = program.task, program.control_dt
-    levels = (*LEVELS, *([ELASTIC] if program.model.robot.elastic else []))
+    known = (*LEVELS, *([ELASTIC] if program.model.robot.elastic else []))
+    levels = ", ".join(f'`"{level}"`' for level in known)
     threshold = gymnasium.spec(f"ce_gym/{name}-v0").reward_threshold
     robot_link = f"[{title(robot)}](../robots/{robot}.md)"
     return [
@@ -97,7 +98,7 @@ def _facts(program: TaskProgram, robot: str, name: str) -> list[tuple[str, str]]
         ("**Episode**", f"{task.episode_length} control steps, {task.episode_length * step:g} s"),
         ("**Reward threshold**", f"{threshold:g}"),
         ("**Ids**", f"`ce_gym/{name}-v0`, `ce_gym/{name}-Armature-v0`"),
-        ("**Levels**", f"`transmission=` {', '.join(f'`\"{level}\"`' for level in levels)}"),
+        ("**Levels**", f"argument `transmission`: {levels}"),
     ]
 
 
