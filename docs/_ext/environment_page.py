@@ -140,7 +140,7 @@ def _rewards(task: Task) -> str:
     weights = {name: own["weight"] if isinstance(own, Mapping) else own for name, own in task.rewards.items()}
     rows = [(f"`{name}`", f"{weight:g}", *_meaning("reward", name)) for name, weight in weights.items()]
     said = "The sum over terms of weight times term times control step"
-    said += "; a negative sum counts as zero." if task.only_positive else "."
+    said += "; a negative sum counts as zero, unless `only_positive=False`." if task.only_positive else "."
     return f"{said}\n\n{table(('Term', 'Weight', 'Meaning', 'Unit'), rows)}"
 
 
