@@ -108,6 +108,12 @@ def check_extras(words: list[str]) -> None:
     assert set(extras.split(",") if extras else ()) <= set(known), what
 
 
+def test_the_table_of_extras_is_complete():
+    page = (ROOT / "docs" / "how-to" / "install.md").read_text(encoding="utf-8").partition("## Systems")[0]
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert sorted(re.findall(r"^\| `([\w-]+)` \|", page, re.MULTILINE)) == sorted(known)
+
+
 def check_module(module: str, words: list[str]) -> None:
     if module == "ce_gym" and words[:1] != ["bench"]:
         if len(words) == 1:  # a subcommand by its name only

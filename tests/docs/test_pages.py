@@ -22,6 +22,8 @@ import ce_gym.viewer
 from ce_gym.bench.measure.report import read_report
 
 PUBLIC = (ce_gym, ce_gym.identify, ce_gym.learn, ce_gym.model, ce_gym.numba, ce_gym.viewer)
+SPECIAL = {"index.html", "genindex.html", "py-modindex.html", "search.html"}
+"""Pages of the site that Sphinx adds, and the front page."""
 SNAPSHOT = ROOT / "tests" / "data" / "public_names.txt"
 
 
@@ -51,6 +53,17 @@ def test_every_robot_and_environment_has_a_page(built: Path):
 def test_every_id_is_on_a_page(built: Path):
     text = "".join(path.read_text() for path in (built / "generated" / "environments").glob("*.html"))
     assert not [name for name in ce_gym.environment_ids() if name not in text]
+
+
+@pytest.mark.slow
+def test_llms_txt_lists_every_page(built: Path):
+    text = (built / "llms.txt").read_text(encoding="utf-8")
+    lines = text.splitlines()
+    assert lines[0] == "# ce_gym"
+    assert lines[2].startswith("> Gymnasium environments for legged robots")
+    listed = re.findall(r"^- \[[^\]]+\]\(([^)]+)\): \S", text, re.MULTILINE)
+    assert len(listed) == sum(line.startswith("- ") for line in lines)
+    assert sorted(listed) == sorted({page.relative_to(built).as_posix() for page in built.rglob("*.html")} - SPECIAL)
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from ce_gym.policies import registered, shelf
 
 IDS = sorted(ce_gym.environment_ids())
 VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
-CHECKED = (  # each has to be compiled; `pytest tests/stress -m stress` checks them all
+CHECKED = (  # each has to be compiled; `pytest tests/envs/test_ids.py -m stress -n auto` checks them all
     *(f"ce_gym/MiniCheetah{task}-v0" for task in ("Run", "Jump", "Backflip")),
     "ce_gym/MiniCheetahVelocity-Armature-v0",
     "ce_gym/CassieVelocity-v0",
@@ -37,6 +37,19 @@ def test_gymnasium_check_env_is_silent(env_id: str):
         check_env(env.unwrapped)
     env.close()
     env.close()  # closing twice is allowed
+
+
+@pytest.mark.stress
+@pytest.mark.parametrize("env_id", IDS)
+def test_the_checkers_of_gymnasium_and_sb3_are_silent(env_id: str):
+    """Rendering depends on the robot only, so it is checked with one id of each."""
+    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(env_id).unwrapped
+        check_env(env, skip_render_check=not env_id.endswith("Velocity-v0"))
+        sb3.check_env(env)
+        env.close()
 
 
 @pytest.mark.parametrize("env_id", IDS)
