@@ -119,7 +119,9 @@ def explain_levels() -> None:
 
     Gymnasium has no hook for unknown ids. Ids that only raise an error would stand in each list of environments.
     """
-    check = registration._check_name_exists
+    check = getattr(registration, "_check_name_exists", None)
+    if check is None:  # a later Gymnasium: its own error suggests the id
+        return
 
     def check_name(namespace: str | None, name: str) -> None:
         stem, _, level = name.partition("-")
