@@ -1,6 +1,7 @@
 """Gymnasium environments for legged robots whose physics keeps rotors, gears and belts.
 
     import gymnasium, ce_gym
+    gymnasium.register_envs(ce_gym)
     env = gymnasium.make("ce_gym/MiniCheetahVelocity-v0")
 
 `load_robot` reads a robot, `Model` is its dynamics at a transmission level, `Simulator` steps thousands of copies,
@@ -11,12 +12,13 @@ from ce_gym.compile.system import usable_cores
 from ce_gym.diagnostics.scene import scene_report
 from ce_gym.dynamics.forces.scene import SceneOptions
 from ce_gym.dynamics.model import Model
-from ce_gym.envs.custom import register_robot
-from ce_gym.envs.registration import environment_ids, register_environments
+from ce_gym.envs.custom import register_robot, register_task
+from ce_gym.envs.registration import environment_ids, explain_levels, register_environments
 from ce_gym.envs.rendering import use_renderers
 from ce_gym.envs.terms.registry import metric, observation, reward, termination
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
 from ce_gym.model.mechanism import LEVELS
+from ce_gym.plugins import PluginWarning, load_plugins
 from ce_gym.policies import LevelWarning, Policy, PolicyError, load_policy, shipped_policies
 from ce_gym.sim.derivatives import StepDerivatives
 from ce_gym.sim.simulator import Simulator
@@ -30,6 +32,7 @@ __all__ = [
     "LevelWarning",
     "LossyImportWarning",
     "Model",
+    "PluginWarning",
     "Policy",
     "PolicyError",
     "Robot",
@@ -44,6 +47,7 @@ __all__ = [
     "metric",
     "observation",
     "register_robot",
+    "register_task",
     "reward",
     "robots",
     "scene_report",
@@ -53,4 +57,6 @@ __all__ = [
 ]
 
 register_environments()
+explain_levels()
 use_renderers("ce_gym.viewer.renderers")
+load_plugins()

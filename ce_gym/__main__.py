@@ -13,6 +13,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from ce_gym.console import InputError, Parser, add_force_argument, examples, file_error, path, print_anything
 from ce_gym.files import guarded, set_force
@@ -32,6 +33,7 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
 
   python -m ce_gym list                  robots, environments and trained policies
   python -m ce_gym new my_robot.urdf     write the YAML file that a robot of one's own needs, guesses marked
+  python -m ce_gym project my_lab        write a package with a robot and a task of one's own
   python -m ce_gym inspect mini_cheetah  clusters and gears of a robot, errors of each transmission level
   python -m ce_gym inspect ENVIRONMENT   scalar operations of an environment's step, feature by feature
   python -m ce_gym train ENVIRONMENT     train a policy
@@ -143,6 +145,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_force_argument(new)
     new.set_defaults(run=_new)
+    project = commands.add_parser(
+        "project",
+        help="write a package with a robot and a task of one's own",
+        description="Write an installable package with a robot, a task, settings of training, a test and a workflow\n"
+        "for GitHub. `import ce_gym` registers its robots and tasks in every process.",
+        epilog=examples("project my_lab", "project my_lab --out ~/work/my_lab"),
+    )
+    project.add_argument("name", metavar="NAME", help="name of the package, such as my_lab")
+    project.add_argument("--out", type=path, metavar="FOLDER", help="a new folder; by default NAME")
+    project.set_defaults(run=_project)
     add_train_command(commands)
     add_evaluate_command(commands)
     add_transfer_command(commands)
@@ -159,14 +171,20 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(args: argparse.Namespace) -> int:
+    import gymnasium
+
     from ce_gym import environment_ids, shipped_policies
     from ce_gym.model.formats.motor_library import motor_table
     from ce_gym.model.load import robot_table
 
     names = [name for name in environment_ids() if name.count("-") == 1]
     print(f"Robots:\n{robot_table()}\n")
-    print("Environments, each also at one level: -Exact (the default), -Coupled, -Armature or -None before -v0:")
+    print('Environments; "-Armature" before "-v0" has that level, and `transmission` selects others:')
     print("\n".join(f"  {name}" for name in names))
+    others = [name for name in gymnasium.registry if name.startswith("ce_gym/") and name not in environment_ids()]
+    if others := [name for name in others if name.count("-") == 1]:
+        print("Environments of other packages:")
+        print("\n".join(f"  {name}" for name in others))
     print(f"\nMotors, for `use` in robot files; figures at the rotor:\n{motor_table()}")
     print("\nPolicies, for `play`:")
     print("\n".join(f"  {name}" for name in shipped_policies()))
@@ -198,6 +216,24 @@ def _new(args: argparse.Namespace) -> int:
         "and, to train, with a module that registers it:\n"
         f"  echo 'import ce_gym; ce_gym.register_robot(\"{path}\")' > my_robots.py\n"
         f"  PYTHONPATH=. python -m ce_gym train my_robots:{stem}Velocity-v0"
+    )
+    return 0
+
+
+def _project(args: argparse.Namespace) -> int:
+    from ce_gym.envs.registration import camel_case
+    from ce_gym.new_project.project import write_project
+
+    folder = args.out or Path(args.name)
+    try:
+        files = write_project(args.name, folder)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    print("\n".join(f"{folder / file}" for file in files))
+    print(
+        f"Then\n  pip install -e {folder}\n"
+        f"  python -m ce_gym train ce_gym/{camel_case(args.name)}RobotCrouch-v0 "
+        f"--config {folder / 'src' / args.name / 'crouch.yaml'}"
     )
     return 0
 

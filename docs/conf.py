@@ -40,7 +40,7 @@ author = copyright = "The ce_gym authors"
 version = release = ce_gym.__version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
-extensions += ["generated_pages", "mathml"]
+extensions += ["generated_pages", "mathml", "llms"]
 exclude_patterns = ["_build", "records", "exactness.md"]
 myst_enable_extensions = ["dollarmath", "amsmath", "attrs_inline"]
 myst_heading_anchors = 3

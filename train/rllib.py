@@ -25,7 +25,6 @@ from ray.rllib.algorithms.algorithm import Algorithm
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
 
-import ce_gym  # noqa: F401  (registers the environments in this process)
 from ce_gym.__main__ import run
 from ce_gym.console import SEED, THREADS, Parser, above_zero, add_force_argument, path, whole
 from ce_gym.files import set_force

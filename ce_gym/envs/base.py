@@ -47,7 +47,7 @@ class BaseEnv(EzPickle):
         self._section = CriticalSection(self._title)
 
     def __getstate__(self) -> dict[str, Any]:
-        attributes = {name: self.__dict__.get(name) for name in ("spec", "_np_random")}
+        attributes = {name: self.__dict__.get(name) for name in ("spec", "_np_random", "_np_random_seed")}
         return {**EzPickle.__getstate__(self), "attributes": attributes, "state": self.snapshot()}
 
     def __setstate__(self, pickled: dict[str, Any]) -> None:

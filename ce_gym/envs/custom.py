@@ -1,26 +1,34 @@
-"""Registration of environments for a robot file of the user.
+"""Registration of robots and tasks of the user.
 
     ids = ce_gym.register_robot("my_robot.yaml")
     env = gymnasium.make("ce_gym/MyRobotVelocity-Armature-v0")
 
-The registry belongs to one process: a worker process that is not a fork must call `register_robot` again, or be given
-the `EnvSpec` in place of the id.
+The registry belongs to one process. Worker processes that are not forks also register robots and tasks of installed
+packages, see `ce_gym.plugins`. Otherwise give them `module:id` or the `EnvSpec` in place of the id.
 """
 
 from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from ce_gym.envs.registration import ids_of, register
+from ce_gym.envs.registration import ids_of, register, reward_threshold
+from ce_gym.envs.runtime.setup import KNOWN, changed_task, own_task
+from ce_gym.envs.task.checks import merged_rewards
+from ce_gym.envs.task.tasks import TASKS
+from ce_gym.model.arguments import check
+from ce_gym.model.assets import OTHERS
 from ce_gym.model.description import Robot
-from ce_gym.model.errors import RobotError, invalid_value
+from ce_gym.model.errors import RobotError, invalid_value, listed_names
 from ce_gym.model.load import load_robot
 
 
 def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tuple[str, ...]:
-    """Register every task at every transmission level for a robot. Repeated calls have no effect.
+    """Register every task of the package for a robot. Repeated calls have no effect.
 
     Args:
         path: A robot file that `load_robot` reads: .yaml, .urdf (a plain URDF needs its YAML file for contacts and
@@ -28,14 +36,14 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
         name: Start of the ids; by default the name of the robot, `my_robot` as `MyRobot`.
 
     Returns:
-        The ids: `ce_gym/<Name><Task>-v0` for the exact level, and `ce_gym/<Name><Task>-<Level>-v0`.
+        The ids: `ce_gym/<Name><Task>-v0` and `ce_gym/<Name><Task>-Armature-v0`.
 
     Raises:
-        RobotError: The file is not valid, the robot does not fit the tasks, or another robot has the ids.
+        RobotError: The file is not valid, the robot does not fit the tasks, or another robot has the name or the ids.
 
     Examples:
         >>> ids = ce_gym.register_robot(ce_gym.load_robot("tello").source, name="my_robot")
-        >>> print(ids[0], ids[3])
+        >>> print(ids[0], ids[1])
         ce_gym/MyRobotVelocity-v0 ce_gym/MyRobotVelocity-Armature-v0
     """
     if not isinstance(path, str | os.PathLike):
@@ -46,8 +54,60 @@ def register_robot(path: str | os.PathLike[str], name: str | None = None) -> tup
     robot = load_robot(file)
     if problems := missing(robot):
         raise problems[0]
-    ids = ids_of(id_stem(robot, name), str(file), bool(robot.elastic))
-    register(ids)
+    of_package = replace(robot, tasks=tuple(task for task in robot.tasks if task[0] in KNOWN))  # others may follow
+    tasks = {task: own_task(of_package, task) for task in TASKS}
+    ids = ids_of(id_stem(robot, name), str(file), tasks)
+    for env_id, arguments in ids.items():
+        task = arguments["task"]
+        register(env_id, arguments, tasks[task], reward_threshold(task, "gait" in tasks[task].rewards))
+    OTHERS[name or robot.name] = file
+    return tuple(ids)
+
+
+def register_task(
+    name: str,
+    base: str = "velocity",
+    *,
+    robots: Iterable[str],
+    reward_threshold: float | None = None,
+    rewards: Mapping[str, Any] | None = None,
+    **changes: Any,
+) -> tuple[str, ...]:
+    """Register a task for some robots. Repeated calls have no effect.
+
+    Args:
+        name: Name of the task, `my_task` for the ids `ce_gym/<Robot>MyTask-v0` and `ce_gym/<Robot>MyTask-Armature-v0`.
+        base: Name of the task to start from.
+        robots: Names of robots of the package or of `register_robot`.
+        reward_threshold: Return of an episode at which the task counts as solved.
+        rewards: Rewards that replace or add to those of the base, as in `gymnasium.make`.
+        **changes: New values of other fields of the task.
+
+    Returns:
+        The ids.
+
+    Raises:
+        ValueError: The name is not valid or belongs to another task, or an argument is not valid.
+        RobotError: A robot does not exist or does not fit the task.
+
+    Examples:
+        >>> ce_gym.register_task("slow_walk", robots=["go1"], command_range=[[0, 0.3], [0, 0], [0, 0]])
+        ('ce_gym/Go1SlowWalk-v0', 'ce_gym/Go1SlowWalk-Armature-v0')
+    """
+    check("name", name, re.fullmatch(r"[a-z][a-z0-9_]*", name), "lower-case letters, digits and underscores")
+    check("base", base, base in KNOWN, f"one of {listed_names(base, KNOWN)}")
+    weights = merged_rewards(KNOWN[base].rewards, {} if rewards is None else rewards)
+    task = changed_task(replace(KNOWN[base], rewards=weights), changes)
+    if KNOWN.get(name, task) != task:
+        raise ValueError(f"name={name!r}; expected a name that no other task has")
+    loaded = {robot: load_robot(robot) for robot in robots}
+    KNOWN[name] = task
+    ids = []
+    for robot, description in loaded.items():
+        path = str(OTHERS.get(robot, robot))
+        for env_id, arguments in ids_of(id_stem(description, robot), path, [name]).items():
+            register(env_id, arguments, own_task(description, name), reward_threshold)
+            ids.append(env_id)
     return tuple(ids)
 
 

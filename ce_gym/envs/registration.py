@@ -1,23 +1,39 @@
-"""Ids of environments: `ce_gym/<Robot><Task>[-<Level>]-v0`."""
+"""Ids of environments: `ce_gym/<Robot><Task>-v0` with exact transmissions, and `ce_gym/<Robot><Task>-Armature-v0`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
 import gymnasium
+from gymnasium.envs import registration
 
 from ce_gym.envs.task.skills import SKILLED, SKILLS
-from ce_gym.envs.task.tasks import TASKS
+from ce_gym.envs.task.tasks import TASKS, Task
 from ce_gym.model.errors import invalid_value
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 
-ROBOTS = (
-    *("mini_cheetah", "mit_humanoid", "tello", "jvrc1"),
-    *("go1", "go2", "anymal_c", "spot", "g1", "h1", "t1", "berkeley_humanoid", "cassie", "dr_legs"),
-)
+QUADRUPEDS = ("mini_cheetah", "go1", "go2", "anymal_c", "spot")
+BIPEDS = ("mit_humanoid", "tello", "jvrc1", "g1", "h1", "t1", "berkeley_humanoid", "cassie", "dr_legs")
+"""Bipeds of the package. Their files add rewards of a gait to the task "velocity", which double its return."""
+ROBOTS = (*QUADRUPEDS, *BIPEDS)
 """Robots of the package that have environments."""
-STRETCHING = ("mini_cheetah",)
-"""Robots with elastic transmissions in their files, which also have the level "elastic"."""
+LEVELS_WITH_IDS = {"exact": "", "armature": "-Armature"}
+"""Transmission levels with ids, and their part of the id. Other levels are an argument of `gymnasium.make`."""
+REWARD_THRESHOLDS = {
+    "velocity": 36.0,
+    "run": 60.0,
+    "stand": 18.0,
+    "jump": 50.0,
+    "high_jump": 18.0,
+    "long_jump": 20.0,
+    "land": 5.0,
+    "hop": 15.0,
+    "recover": 10.0,
+    "backflip": 20.0,
+}
+"""Return of an episode at which a task counts as solved: 70 to 90 % of that of a trained policy, where one exists."""
+GAIT_FACTOR = 2.0
+"""Threshold of "velocity" with rewards of a gait, over that without."""
 
 
 def camel_case(name: str) -> str:
@@ -26,15 +42,15 @@ def camel_case(name: str) -> str:
 
 
 def environment_ids() -> dict[str, dict[str, str]]:
-    """Return the arguments of each id. An id without a level has the exact level.
+    """Return the arguments of each id of the package.
 
     Examples:
-        >>> ce_gym.environment_ids()["ce_gym/TelloVelocity-None-v0"]
-        {'robot': 'tello', 'task': 'velocity', 'transmission': 'none'}
+        >>> ce_gym.environment_ids()["ce_gym/TelloVelocity-Armature-v0"]
+        {'robot': 'tello', 'task': 'velocity', 'transmission': 'armature'}
     """
     ids = {}
     for robot in ROBOTS:
-        ids |= ids_of(f"ce_gym/{camel_case(robot)}", robot, robot in STRETCHING, tasks_of(robot))
+        ids |= ids_of(f"ce_gym/{camel_case(robot)}", robot, tasks_of(robot))
     return ids
 
 
@@ -43,45 +59,75 @@ def tasks_of(robot: str) -> tuple[str, ...]:
     return (*TASKS, *(skill for skill, robots in SKILLED.items() if robot in robots))
 
 
-def ids_of(stem: str, robot: str, stretches: bool, tasks: Iterable[str] = tuple(TASKS)) -> dict[str, dict[str, str]]:
-    """Return the arguments of every id of a robot: `<stem><Task>[-<Level>]-v0`.
+def ids_of(stem: str, robot: str, tasks: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Return the arguments of every id of a robot.
 
     Args:
         stem: Start of the ids.
         robot: A name or a path.
-        stretches: Whether the robot has elastic transmissions.
         tasks: Names of tasks.
     """
-    levels = (None, *LEVELS, ELASTIC) if stretches else (None, *LEVELS)
-    ids = {}
-    for task in tasks:
-        for level in levels:
-            name = f"{stem}{camel_case(task)}{f'-{camel_case(level)}' if level else ''}-v0"
-            ids[name] = {"robot": robot, "task": task, "transmission": level or "exact"}
-    return ids
+    return {
+        f"{stem}{camel_case(task)}{suffix}-v0": {"robot": robot, "task": task, "transmission": level}
+        for task in tasks
+        for level, suffix in LEVELS_WITH_IDS.items()
+    }
 
 
 def register_environments() -> None:
     """Register every id of the package. Repeated calls have no effect."""
-    register(environment_ids())
+    tasks = {**TASKS, **SKILLS}
+    for name, arguments in environment_ids().items():
+        robot, task = arguments["robot"], arguments["task"]
+        register(name, arguments, tasks[task], reward_threshold(task, robot in BIPEDS))
 
 
-def register(ids: Mapping[str, Mapping[str, str]]) -> None:
-    """Register ids with Gymnasium. Repeated calls have no effect.
+def reward_threshold(task: str, has_gait: bool) -> float:
+    """Return the return of an episode at which a task of the package counts as solved."""
+    return REWARD_THRESHOLDS[task] * (GAIT_FACTOR if has_gait and task == "velocity" else 1.0)
+
+
+def register(name: str, arguments: Mapping[str, str], task: Task, threshold: float | None) -> None:
+    """Register an id with Gymnasium. Repeated calls have no effect.
+
+    Args:
+        name: The id.
+        arguments: Arguments of the environment.
+        task: The task, for its time limit.
+        threshold: Return of an episode at which the task counts as solved.
 
     Raises:
-        RobotError: An id is registered with other arguments.
+        RobotError: The id is registered with other arguments.
     """
-    for name, arguments in ids.items():
-        if name in gymnasium.registry:
-            if dict(gymnasium.registry[name].kwargs) != arguments:
-                expected = "an id that no other robot has; give it a `name`"
-                raise invalid_value(arguments["robot"], "environment id", name, expected)
-            continue
-        gymnasium.register(
-            name,
-            entry_point="ce_gym.envs.single:LeggedEnv",
-            vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
-            max_episode_steps={**TASKS, **SKILLS}[arguments["task"]].episode_length,
-            kwargs=dict(arguments),
-        )
+    if name in gymnasium.registry:
+        if dict(gymnasium.registry[name].kwargs) != arguments:
+            expected = "an id that no other robot has; give it a `name`"
+            raise invalid_value(arguments["robot"], "environment id", name, expected)
+        return
+    gymnasium.register(
+        name,
+        entry_point="ce_gym.envs.single:LeggedEnv",
+        vector_entry_point="ce_gym.envs.vector:LeggedVectorEnv",
+        reward_threshold=threshold,
+        max_episode_steps=task.episode_length,
+        kwargs=dict(arguments),
+    )
+
+
+def explain_levels() -> None:
+    """Add the id and the argument to use to Gymnasium's error for an id with another level, such as "-None".
+
+    Gymnasium has no hook for unknown ids. Ids that only raise an error would stand in each list of environments.
+    """
+    check = getattr(registration, "_check_name_exists", None)
+    if check is None:  # a later Gymnasium: its own error suggests the id
+        return
+
+    def check_name(namespace: str | None, name: str) -> None:
+        stem, _, level = name.partition("-")
+        if f"{namespace}/{stem}-Armature-v0" in gymnasium.registry and level.lower() in (*LEVELS, ELASTIC):
+            call = f'gymnasium.make("{namespace}/{stem}-v0", transmission="{level.lower()}")'
+            raise gymnasium.error.NameNotFound(f"{namespace}/{name}: levels are an argument; use {call}")
+        check(namespace, name)
+
+    registration._check_name_exists = check_name

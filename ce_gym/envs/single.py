@@ -34,7 +34,7 @@ class LeggedEnv(BaseEnv, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         **kwargs: See `ce_gym.envs.runtime.setup.make_batch`.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES]}  # noqa: RUF012  (Gymnasium's own declaration)
+    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 50}  # noqa: RUF012
 
     def __init__(
         self,
@@ -65,7 +65,7 @@ class LeggedEnv(BaseEnv, gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]
         check_options(options)
         keys = None if seed is None else self._keys(seed)
         with self._exclusive():
-            gymnasium.Env.reset(self, seed=seed)
+            gymnasium.Env.reset(self, seed=None if seed is None else int(seed))
             if keys is None and not self.batch.arrays["seeded"][0]:
                 keys = self.np_random.integers(2**63, size=1)
             if keys is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -30,6 +30,8 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
     - `reward_terms`: the weighted reward terms by name, each (num_envs,).
     - `terrain_level` and `times_grown` of tasks with curricula: the progress of each robot.
     - `episode_terms` where an episode has ended: length, return, sum of each reward term, mean of each metric.
+    - `final_obs` and `final_info` in mode SameStep where an episode has ended: the last observation, and all of the
+      above with a mask `_<key>` for each key, as in Gymnasium's `SyncVectorEnv`.
 
     On a GPU, actions, observations and rewards are torch tensors on this GPU. The same seeds give the same random
     streams. To avoid synchronisation, the autoreset mode is SameStep, `infos` always has `episode_terms`, `final_obs`
@@ -53,7 +55,11 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         ValueError: The device does not exist, or an argument is not valid.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": [*RENDER_MODES],
+        "render_fps": 50,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
 
     def __init__(
         self,
@@ -107,7 +113,7 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         batch, mask = self.batch, self._reset_mask(options)
         keys, to_seed = None if seed is None else self._keys(seed), mask
         with self._exclusive():
-            VectorEnv.reset(self, seed=seed if isinstance(seed, int) else None)
+            VectorEnv.reset(self, seed=int(seed) if isinstance(seed, int | np.integer) else None)
             if keys is None and (to_seed := mask & ~batch.arrays["seeded"]).any():
                 keys = self.np_random.integers(2**63, size=self.num_envs)
             if keys is not None:
@@ -159,7 +165,8 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
             infos["episode_terms"], infos["_episode_terms"] = self._episode_terms(o), o.done
             if same_step:
                 infos["final_obs"], infos["_final_obs"] = self._observation(o.final_observation), o.done
-                infos["final_info"], infos["_final_info"] = {"diverged": batch.place.copy(o.diverged)}, o.done
+                final = {name: infos[name] for name in infos if not name.startswith(("_", "final_"))}
+                infos["final_info"], infos["_final_info"] = _masked(final, o.done), o.done
         return o, infos
 
     def _episode_terms(self, outcome: Outcome) -> dict[str, Array]:
@@ -213,6 +220,15 @@ class LeggedVectorEnv(BaseEnv, VectorEnv[Any, Any, Any]):
         if mask is None:
             return place.rows(True, "bool", (n,))
         return place.rows(check_mask("reset_mask", mask, n, some=True), "bool")
+
+
+def _masked(infos: Mapping[str, Any], mask: Array) -> dict[str, Any]:
+    """Return a copy of `infos` with zeros where the mask is false, and with the mask as `_<key>` of each key."""
+    masked = {}
+    for key, value in infos.items():
+        masked[key] = _masked(value, mask) if isinstance(value, Mapping) else value * mask
+        masked[f"_{key}"] = mask
+    return masked
 
 
 def _autoreset_mode(mode: str | AutoresetMode | None, place: Device) -> AutoresetMode:

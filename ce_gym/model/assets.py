@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+OTHERS: dict[str, Path] = {}
+"""Files of robots that other packages have registered, by name."""
+
 
 def robots() -> list[str]:
     """Return the names of the robots that come with the package.

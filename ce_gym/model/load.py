@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from ce_gym.model.assets import assets_folder, robots
+from ce_gym.model.assets import OTHERS, assets_folder, robots
 from ce_gym.model.clusters import cluster_tree
 from ce_gym.model.description import Robot
 from ce_gym.model.errors import RobotError, invalid_value, unknown_name
@@ -32,8 +32,9 @@ def load_robot(name_or_path: str | os.PathLike[str], *, floating: bool | None = 
     - `.xml`: MJCF, read through the package `mujoco`.
 
     Args:
-        name_or_path: A name such as "mini_cheetah" (`robots()` lists them), the path of a file, or a robot that an
-            installed package downloads: "menagerie:unitree_go2", "robot_descriptions:go2_description".
+        name_or_path: A name such as "mini_cheetah" (`robots()` lists them) or of a robot that has been registered, the
+            path of a file, or a robot that an installed package downloads: "menagerie:unitree_go2",
+            "robot_descriptions:go2_description".
         floating: Whether the root link of a URDF or URDF+ moves freely or is fixed to the world. By default a root
             link without mass, or called "world", is fixed. In other formats the file describes its base.
 
@@ -73,8 +74,10 @@ def _from_urdf(path: Path, floating: bool | None) -> Robot:
 
 
 def _asset(name: str) -> Path:
+    if name in OTHERS:
+        return OTHERS[name]
     if name not in robots():
-        raise unknown_name(str(assets_folder()), "robot", name, robots(), "the name of a robot")
+        raise unknown_name(str(assets_folder()), "robot", name, [*robots(), *OTHERS], "the name of a robot")
     return assets_folder() / name / f"{name}.yaml"
 
 

@@ -9,8 +9,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import Field, fields
 from typing import Any
 
+import gymnasium
+
 from ce_gym.dynamics.forces.scene import SceneOptions
-from ce_gym.envs.registration import STRETCHING, camel_case
+from ce_gym.envs.registration import camel_case
 from ce_gym.envs.runtime.program import TaskProgram
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.runtime.stages import OBSERVATION_BOUND
@@ -83,17 +85,20 @@ def title(robot: str) -> str:
 def _facts(program: TaskProgram, robot: str, name: str) -> list[tuple[str, str]]:
     n, m, bound = program.n_actions, program.observation_size, OBSERVATION_BOUND
     task, step = program.task, program.control_dt
-    known = (None, *LEVELS, *([ELASTIC] if robot in STRETCHING else []))
-    levels = [f"`ce_gym/{name}{f'-{camel_case(level)}' if level else ''}-v0`" for level in known]
+    known = (*LEVELS, *([ELASTIC] if program.model.robot.elastic else []))
+    levels = ", ".join(f'`"{level}"`' for level in known)
+    threshold = gymnasium.spec(f"ce_gym/{name}-v0").reward_threshold
     robot_link = f"[{title(robot)}](../robots/{robot}.md)"
     return [
         ("**Robot**", robot_link),
         ("**Action space**", f"`Box(-1.0, 1.0, ({n},), float32)`"),
         ("**Observation space**", f"`Box({-bound}, {bound}, ({m},), float32)`"),
-        ("**Import**", f'`gymnasium.make("ce_gym/{name}-v0")` after `import ce_gym`'),
+        ("**Import**", f'`gymnasium.make("ce_gym/{name}-v0")` after `gymnasium.register_envs(ce_gym)`'),
         ("**Control step**", f"{step:g} s: {task.n_substeps} sub-steps of {1e3 * task.dt:g} ms"),
         ("**Episode**", f"{task.episode_length} control steps, {task.episode_length * step:g} s"),
-        ("**Ids, level by level**", " ".join(levels)),
+        ("**Reward threshold**", f"{threshold:g}"),
+        ("**Ids**", f"`ce_gym/{name}-v0`, `ce_gym/{name}-Armature-v0`"),
+        ("**Levels**", f"argument `transmission`: {levels}"),
     ]
 
 
@@ -135,7 +140,7 @@ def _rewards(task: Task) -> str:
     weights = {name: own["weight"] if isinstance(own, Mapping) else own for name, own in task.rewards.items()}
     rows = [(f"`{name}`", f"{weight:g}", *_meaning("reward", name)) for name, weight in weights.items()]
     said = "The sum over terms of weight times term times control step"
-    said += "; a negative sum counts as zero." if task.only_positive else "."
+    said += "; a negative sum counts as zero, unless `only_positive=False`." if task.only_positive else "."
     return f"{said}\n\n{table(('Term', 'Weight', 'Meaning', 'Unit'), rows)}"
 
 

@@ -15,7 +15,9 @@ import ce_gym
 def test_the_checker_is_silent():
     """On every task and a skill; others differ in numbers only, and each has to be compiled."""
     tasks = {"velocity", "run", "stand", "jump", "backflip"}
-    ids = [i for i, a in ce_gym.environment_ids().items() if a["robot"] == "mini_cheetah" and "-Exact" in i]
+    ids = [
+        i for i, a in ce_gym.environment_ids().items() if a["robot"] == "mini_cheetah" and a["transmission"] == "exact"
+    ]
     ids = [i for i in ids if ce_gym.environment_ids()[i]["task"] in tasks]
     assert len(ids) == len(tasks)
     for env_id in ids:

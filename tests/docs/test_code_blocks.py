@@ -56,6 +56,16 @@ def test_pages_have_code():
     assert pages <= {name_of(p) for p in WITH_CODE}
 
 
+def test_examples_register_environments():
+    """A linter removes an import that is not used; `register_envs` uses it, and an id `module:id` imports by itself."""
+    made = re.compile(r"gymnasium\.make(?:_vec)?\(\s*\"(?!\w+:)")
+    scripts = {name_of(page): script(page) for page in PAGES}
+    scripts |= {str(path.relative_to(ROOT)): path.read_text() for path in (ROOT / "train").rglob("*.py")}
+    makers = {name: text for name, text in scripts.items() if made.search(text)}
+    assert len(makers) >= 9
+    assert [name for name, text in makers.items() if "gymnasium.register_envs(" not in text] == []
+
+
 def test_commands_exist():
     """Subcommands, options, scripts, environments, extras and make targets of all commands in all pages."""
     wrong = []
@@ -96,6 +106,12 @@ def check_extras(words: list[str]) -> None:
     what, extras = re.fullmatch(r"(ce_gym|\.)(?:\[([\w,-]+)\])?", words[-1]).groups()
     assert words[:2] == ["pip", "install"]
     assert set(extras.split(",") if extras else ()) <= set(known), what
+
+
+def test_the_table_of_extras_is_complete():
+    page = (ROOT / "docs" / "how-to" / "install.md").read_text(encoding="utf-8").partition("## Systems")[0]
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert sorted(re.findall(r"^\| `([\w-]+)` \|", page, re.MULTILINE)) == sorted(known)
 
 
 def check_module(module: str, words: list[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import re
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -13,11 +14,17 @@ import pytest
 from pages import ROOT
 
 import ce_gym
+import ce_gym.identify
+import ce_gym.learn
 import ce_gym.model
+import ce_gym.numba
 import ce_gym.viewer
 from ce_gym.bench.measure.report import read_report
 
-PUBLIC = (ce_gym, ce_gym.model, ce_gym.viewer)
+PUBLIC = (ce_gym, ce_gym.identify, ce_gym.learn, ce_gym.model, ce_gym.numba, ce_gym.viewer)
+SPECIAL = {"index.html", "genindex.html", "py-modindex.html", "search.html"}
+"""Pages of the site that Sphinx adds, and the front page."""
+SNAPSHOT = ROOT / "tests" / "data" / "public_names.txt"
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +56,17 @@ def test_every_id_is_on_a_page(built: Path):
 
 
 @pytest.mark.slow
+def test_llms_txt_lists_every_page(built: Path):
+    text = (built / "llms.txt").read_text(encoding="utf-8")
+    lines = text.splitlines()
+    assert lines[0] == "# ce_gym"
+    assert lines[2].startswith("> Gymnasium environments for legged robots")
+    listed = re.findall(r"^- \[[^\]]+\]\(([^)]+)\): \S", text, re.MULTILINE)
+    assert len(listed) == sum(line.startswith("- ") for line in lines)
+    assert sorted(listed) == sorted({page.relative_to(built).as_posix() for page in built.rglob("*.html")} - SPECIAL)
+
+
+@pytest.mark.slow
 def test_every_public_name_is_in_the_reference(built: Path):
     from sphinx.util.inventory import InventoryFile
 
@@ -59,6 +77,18 @@ def test_every_public_name_is_in_the_reference(built: Path):
     homes = {f"ce_gym.{name}" for name in ce_gym.__all__}
     missing = [n for n in names if n not in known and f"ce_gym.{n.rsplit('.', 1)[1]}" not in homes & known]
     assert not missing
+
+
+def test_public_names_change_on_purpose_only():
+    """A name that comes or goes is written into the snapshot, and into CHANGELOG.md."""
+    api = "".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference" / "api").glob("*.md"))
+    public = {f"{module.__name__}.{name}" for module in PUBLIC for name in module.__all__}
+    public |= set(re.findall(r"^\.\. (?:auto(?!module)\w+|py:data):: (ce_gym\.[\w.]+)", api, re.MULTILINE))
+    snapshot = SNAPSHOT.read_text(encoding="utf-8").split()
+    assert snapshot == sorted(snapshot)
+    assert (public - set(snapshot), set(snapshot) - public) == (set(), set())
+    page = (ROOT / "docs" / "reference" / "api" / "public.md").read_text(encoding="utf-8")
+    assert [module.__name__ for module in PUBLIC if f"`{module.__name__}`" not in page] == []
 
 
 def test_what_returns_arrays_says_their_shape():

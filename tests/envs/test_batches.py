@@ -89,6 +89,41 @@ def test_fresh_arrays_out_of_every_call():
     assert not any(np.shares_memory(a, b) for i, a in enumerate(kept) for b in kept[:i])
 
 
+def masks_removed(infos: dict) -> dict:
+    """Infos without masks, after a check that each key has one."""
+    assert {f"_{key}" for key in infos if key[0] != "_"} == {key for key in infos if key[0] == "_"}
+    values = {key: value for key, value in infos.items() if key[0] != "_"}
+    return {key: masks_removed(value) if isinstance(value, dict) else value for key, value in values.items()}
+
+
+def test_final_info_is_that_of_gymnasium_s_own_vector_environment():
+    """Every key, with its mask; values are zero where no episode has ended."""
+    n, options = 3, {"terrain": "rough", "num_threads": 1}
+    envs = gymnasium.make_vec(VELOCITY, num_envs=n, autoreset_mode="SameStep", **options)
+    mode = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
+    stock = gymnasium.make_vec(VELOCITY, num_envs=n, vectorization_mode="sync", vector_kwargs=mode, **options)
+    for one in (envs, stock):
+        one.reset(seed=20)
+    ended = 0
+    for action in random_actions(400, n, seed=1):
+        *_, infos = envs.step(action)
+        *_, theirs = stock.step(action)
+        assert ("final_info" in infos) == ("final_info" in theirs)
+        if "final_info" not in infos:
+            continue
+        ended += 1
+        final, expected = infos["final_info"], theirs["final_info"]
+        assert {key for key in infos if key[0] != "_"} - {"final_info", "final_obs"} == set(masks_removed(final))
+        np.testing.assert_array_equal(infos["_final_info"], theirs["_final_info"])
+        for key in ("diverged", "terrain_level"):
+            np.testing.assert_array_equal(final[key], expected[key], err_msg=key)
+            np.testing.assert_array_equal(final[f"_{key}"], expected[f"_{key}"])
+        for name in infos["reward_terms"]:
+            np.testing.assert_array_equal(final["reward_terms"][name], expected[f"reward_{name}"])
+            np.testing.assert_array_equal(final["reward_terms"][f"_{name}"], expected[f"_reward_{name}"])
+    assert ended >= 2
+
+
 def test_stock_vector_wrappers():
     envs = NormalizeObservation(RecordEpisodeStatistics(gymnasium.make_vec(VELOCITY, num_envs=6, max_episode_steps=4)))
     envs.reset(seed=0)

@@ -9,11 +9,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ce_gym.envs.custom import register_robot
+from ce_gym.envs.custom import register_robot, register_task
+from ce_gym.envs.runtime import setup
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.task.tasks import TASKS
-from ce_gym.model import RobotError, assets_folder
-from ce_gym.model.mechanism import ELASTIC, LEVELS
+from ce_gym.model import RobotError, assets_folder, load_robot
+from ce_gym.model.assets import OTHERS
 
 pytestmark = pytest.mark.filterwarnings("ignore::ce_gym.model.InertiaWarning")
 
@@ -37,16 +38,18 @@ def dog(tmp_path: Path):
 
 @pytest.fixture(autouse=True)
 def registry():
-    """Leave the registry as it was."""
-    before = dict(gymnasium.registry)
+    """Leave all registries as they were."""
+    registries = (gymnasium.registry, setup.KNOWN, OTHERS)
+    copies = [dict(each) for each in registries]
     yield
-    gymnasium.registry.clear()
-    gymnasium.registry.update(before)
+    for each, copy in zip(registries, copies, strict=True):
+        each.clear()
+        each.update(copy)
 
 
-def test_every_task_at_every_level_has_an_id(dog):
+def test_every_task_has_an_exact_and_a_simplified_id(dog):
     ids = register_robot(dog())
-    assert len(set(ids)) == len(TASKS) * len((None, *LEVELS, ELASTIC))
+    assert len(set(ids)) == len(TASKS) * 2
     assert set(ids) >= {"ce_gym/MyDogVelocity-v0", "ce_gym/MyDogVelocity-Armature-v0"}
     assert all(env_id in gymnasium.registry for env_id in ids)
     assert Path(gymnasium.spec(ids[0]).kwargs["robot"]).is_absolute(), "it works from any folder"
@@ -56,12 +59,19 @@ def test_the_environment_is_that_robot_s(dog):
     path = dog(("height: ", "height: 0.31 #"))
     ids = register_robot(path, name="flat dog")
     assert ids[0] == "ce_gym/FlatDogVelocity-v0"
-    env = gymnasium.make("ce_gym/FlatDogVelocity-None-v0")
+    env = gymnasium.make("ce_gym/FlatDogVelocity-v0", transmission="none")
     observation, _ = env.reset(seed=0)
     assert observation in env.observation_space
     *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
     assert not info.get("diverged", False)
     env.close()
+
+
+def test_limits_follow_the_file(dog):
+    ids = register_robot(dog(("\ntasks:", "\ntasks:\n  velocity: {episode_length: 300, rewards: {gait: 0.5}}")))
+    spec, other = gymnasium.spec(ids[0]), gymnasium.spec("ce_gym/MiniCheetahVelocity-v0")
+    assert (spec.max_episode_steps, other.max_episode_steps) == (300, 1000)
+    assert spec.reward_threshold == 2 * other.reward_threshold
 
 
 def test_twice_is_once_but_another_robot_needs_another_name(dog):
@@ -113,3 +123,44 @@ def test_a_robot_without_knee_spheres_has_every_task(dog):
         assert f"ce_gym/MyDog{task.capitalize()}-v0" in ids
     with pytest.raises(ValueError, match="contacts='knee'; expected"):
         make_program(str(path), "stand", contacts=["foot", "knee"])
+
+
+def test_a_registered_robot_has_a_name(dog):
+    path = dog()
+    register_robot(path, name="rex")
+    assert load_robot("rex").source == load_robot(path).source
+    with pytest.raises(RobotError, match=r"robot is 'rexx'.*did you mean 'rex'"):
+        load_robot("rexx")
+
+
+def test_a_task_of_one_s_own(dog):
+    register_robot(dog(("\ntasks:", "\ntasks:\n  crawl: {episode_length: 200}")).resolve(), name="rex")
+    changes = {"rewards": {"base_height": 0}, "command_range": [[0, 0.2], [0, 0], [0, 0]], "episode_length": 500}
+    ids = register_task("crawl", robots=["rex", "go1"], reward_threshold=3.0, **changes)
+    assert ids == tuple(f"ce_gym/{robot}Crawl{level}-v0" for robot in ("Rex", "Go1") for level in ("", "-Armature"))
+    assert [gymnasium.spec(env_id).max_episode_steps for env_id in ids] == [200, 200, 500, 500]
+    assert {gymnasium.spec(env_id).reward_threshold for env_id in ids} == {3.0}
+    env = gymnasium.make(ids[3]).unwrapped
+    task = env.batch.program.task
+    assert (env.model.transmission, task.command_range[0]) == ("armature", (0, 0.2))
+    assert "base_height" not in task.rewards
+    assert register_task("crawl", robots=["rex", "go1"], reward_threshold=3.0, **changes) == ids
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"name": "Crawl", "robots": ["go1"]}, ValueError, "name='Crawl'; expected lower-case letters"),
+        ({"name": "crawl", "base": "wlak", "robots": ["go1"]}, ValueError, "base='wlak'; expected one of velocity"),
+        ({"name": "crawl", "robots": ["go11"]}, RobotError, "robot is 'go11'"),
+        ({"name": "run", "robots": ["go1"]}, ValueError, "name='run'; expected a name that no other task has"),
+        ({"name": "crawl", "robots": ["go1"], "histry": 2}, Exception, "histry"),
+    ],
+)
+def test_a_wrong_task_is_not_registered(arguments, error, message):
+    before = dict(gymnasium.registry)
+    with pytest.raises(error) as caught:
+        register_task(**arguments)
+    assert message in str(caught.value)
+    assert dict(gymnasium.registry) == before
+    assert "crawl" not in setup.KNOWN

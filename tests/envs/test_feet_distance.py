@@ -16,7 +16,9 @@ LEAST = 0.2
 def test_shortfall_between_left_and_right(name: str, sides: list[tuple[int, int]]):
     """`sides` are left and right feet, in the order of the robot's contacts."""
     options = {"rewards": {"feet_distance": {"weight": 1.0, "least": LEAST}}, "autoreset_mode": "SameStep"}
-    envs = gymnasium.make_vec(f"ce_gym/{name}Velocity-None-v0", num_envs=8, max_episode_steps=20, **options)
+    envs = gymnasium.make_vec(
+        f"ce_gym/{name}Velocity-v0", transmission="none", num_envs=8, max_episode_steps=20, **options
+    )
     envs.reset(seed=0)
     native, rng, short = envs.unwrapped, np.random.default_rng(0), 0
     contacts = native.model.robot.contacts

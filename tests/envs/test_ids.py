@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import re
 import subprocess
 import sys
 import warnings
@@ -13,16 +15,16 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import ce_gym
-from ce_gym.envs.registration import STRETCHING
+from ce_gym.__main__ import main
+from ce_gym.envs.registration import BIPEDS
+from ce_gym.envs.runtime.setup import own_task
+from ce_gym.policies import PolicyError, environment_of, registered, shelf
 
 IDS = sorted(ce_gym.environment_ids())
 VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
-ROBOTS = {
-    arguments["robot"]: env_id for env_id, arguments in ce_gym.environment_ids().items() if "Velocity-v0" in env_id
-}
-CHECKED = (  # each has to be compiled; `pytest tests/stress -m stress` checks them all
+CHECKED = (  # each has to be compiled; `pytest tests/envs/test_ids.py -m stress -n auto` checks them all
     *(f"ce_gym/MiniCheetah{task}-v0" for task in ("Run", "Jump", "Backflip")),
-    "ce_gym/MiniCheetahVelocity-Elastic-v0",
+    "ce_gym/MiniCheetahVelocity-Armature-v0",
     "ce_gym/CassieVelocity-v0",
 )
 
@@ -38,6 +40,19 @@ def test_gymnasium_check_env_is_silent(env_id: str):
     env.close()  # closing twice is allowed
 
 
+@pytest.mark.stress
+@pytest.mark.parametrize("env_id", IDS)
+def test_the_checkers_of_gymnasium_and_sb3_are_silent(env_id: str):
+    """Rendering depends on the robot only, so it is checked with one id of each."""
+    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gymnasium.make(env_id).unwrapped
+        check_env(env, skip_render_check=not env_id.endswith("Velocity-v0"))
+        sb3.check_env(env)
+        env.close()
+
+
 @pytest.mark.parametrize("env_id", IDS)
 def test_spec_survives_json(env_id: str):
     spec = gymnasium.spec(env_id)
@@ -50,13 +65,77 @@ def test_an_environment_from_its_spec():
     assert gymnasium.make(spec).unwrapped.model.transmission == "armature"
 
 
-def test_every_level_has_an_id():
-    levels = {gymnasium.spec(env_id).kwargs["transmission"] for env_id in IDS}
-    assert levels == {"exact", "coupled", "armature", "none", "elastic"}
+def test_ids_are_few():
+    listed = {env_id for env_id in gymnasium.registry if env_id.startswith("ce_gym/")}
+    assert set(IDS) <= listed
+    assert len(IDS) <= 160
+    assert {re.sub(r"-Armature(?=-v0)", "", env_id) for env_id in IDS} == {i for i in IDS if "-Armature" not in i}
 
 
-def test_robots_with_elastic_transmissions_have_that_level():
-    assert [robot for robot in ROBOTS if ce_gym.load_robot(robot).elastic] == list(STRETCHING)
+@pytest.mark.parametrize("level", ["Exact", "Coupled", "None", "Elastic"])
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec, gymnasium.spec, registered])
+def test_the_error_for_another_level_names_id_and_argument(make, level: str):
+    with pytest.raises(gymnasium.error.NameNotFound) as error:
+        make(f"ce_gym/TelloStand-{level}-v0")
+    use = f'use gymnasium.make("ce_gym/TelloStand-v0", transmission="{level.lower()}")'
+    assert str(error.value) == f"ce_gym/TelloStand-{level}: levels are an argument; {use}"
+
+
+@pytest.mark.parametrize("line", ["inspect ce_gym/TelloStand-None-v0", "train ce_gym/TelloStand-None-v0"])
+def test_commands_name_id_and_argument_in_one_line(line: str, capsys: pytest.CaptureFixture[str]):
+    assert main(line.split()) == 2
+    error = capsys.readouterr().err
+    assert 'gymnasium.make("ce_gym/TelloStand-v0", transmission="none")' in error
+    assert error.count("\n") == 1
+
+
+def test_a_policy_of_another_level_s_id_names_id_and_argument():
+    with pytest.raises(
+        PolicyError, match=r'MODULE:.* use gymnasium\.make\("ce_gym/TelloStand-v0", transmission='
+    ):
+        environment_of({"env": "ce_gym/TelloStand-None-v0"})
+
+
+def test_unknown_ids_have_the_error_of_gymnasium():
+    with pytest.raises(gymnasium.error.NameNotFound, match=r"doesn't exist in namespace ce_gym\. Did you mean"):
+        gymnasium.make("ce_gym/TelloStnd-None-v0")
+    with pytest.raises(gymnasium.error.NameNotFound, match="doesn't exist"):
+        gymnasium.make("CartPool-None-v0")
+
+
+@pytest.mark.parametrize("env_id", [env_id for env_id in IDS if "-Armature" not in env_id])
+def test_limits_of_the_spec_are_those_of_the_task(env_id: str):
+    spec = gymnasium.spec(env_id)
+    task = own_task(ce_gym.load_robot(spec.kwargs["robot"]), spec.kwargs["task"])
+    assert spec.max_episode_steps == task.episode_length
+    assert spec.reward_threshold > 0
+    if spec.kwargs["task"] == "velocity":
+        assert (spec.kwargs["robot"] in BIPEDS) == ("gait" in task.rewards)
+
+
+def test_shipped_policies_solve_their_environments():
+    """With the arguments of the id; the return is in the card."""
+    solved = 0
+    for name in ce_gym.shipped_policies():
+        record = ce_gym.load_policy(name).record
+        if set(record["env_kwargs"]) <= {"transmission"}:
+            row = next(line for line in (shelf() / name / "card.md").read_text().splitlines() if "(trained)" in line)
+            assert float(row.split("|")[-2]) > gymnasium.spec(record["env"]).reward_threshold, name
+            solved += 1
+    assert solved >= 15
+
+
+def test_random_numbers_and_seeds_are_as_gymnasium_keeps_them():
+    options = {"transmission": "none", "num_threads": 1}
+    for env in (gymnasium.make(VELOCITY, **options).unwrapped, gymnasium.make_vec(VELOCITY, 2, **options).unwrapped):
+        env.reset(seed=np.int64(5))
+        assert env.np_random_seed == 5
+        assert env.np_random.random() == np.random.Generator(np.random.PCG64(5)).random()
+        copy = pickle.loads(pickle.dumps(env))
+        assert copy.np_random_seed == 5
+        assert copy.np_random.random() == env.np_random.random()
+        assert type(env).metadata["render_fps"] == env.metadata["render_fps"] == 50
+        env.close()
 
 
 def test_ids_work_in_a_process_that_has_not_imported_the_package():

@@ -11,7 +11,7 @@ from ce_gym.envs.registration import environment_ids
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.task.skills import SKILLED, SKILLS
 
-ID, STEPS, ROBOTS = "ce_gym/MiniCheetahStand-None-v0", 12, 16
+ID, STEPS, ROBOTS = "ce_gym/MiniCheetahStand-v0", 12, 16
 START = {"height": [0.8, 1.2], "lean": [0.2, 0.9]}
 
 
@@ -21,6 +21,7 @@ def flight() -> dict[str, np.ndarray]:
     envs = gymnasium.make_vec(
         ID,
         num_envs=ROBOTS,
+        transmission="none",
         contacts=(),
         start=START,
         reset_noise={"base_velocity": 2.0},
@@ -94,8 +95,8 @@ def test_metrics_at_the_end_are_no_means(flight):
 def test_the_pitch_at_touch_down_is_that_at_the_end_of_the_longest_flight():
     """A drop, then whatever bounces come of it; flights are found in the states by contact spheres."""
     envs = gymnasium.make_vec(
-        ID, num_envs=ROBOTS, start={"height": [0.2, 0.6], "lean": [0.1, 0.6]}, terminations=(), push_period=0.0,
-        metrics=["touch_down_pitch"], max_episode_steps=40, autoreset_mode="SameStep",
+        ID, num_envs=ROBOTS, transmission="none", start={"height": [0.2, 0.6], "lean": [0.1, 0.6]}, terminations=(),
+        push_period=0.0, metrics=["touch_down_pitch"], max_episode_steps=40, autoreset_mode="SameStep",
     )  # fmt: skip
     envs.reset(seed=7)
     model, states = envs.unwrapped.model, []

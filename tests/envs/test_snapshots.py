@@ -13,9 +13,10 @@ from tripod import TRIPOD
 
 import ce_gym
 
-ID = "ce_gym/MiniCheetahVelocity-None-v0"
+ID = "ce_gym/MiniCheetahVelocity-v0"
 N = 5
 OPTIONS = {
+    "transmission": "none",
     "robot": TRIPOD,
     "history": 2,
     "randomise": {"friction": (0.5, 1.0)},

@@ -14,7 +14,7 @@ import ce_gym
 from ce_gym.envs.runtime.setup import make_program
 from ce_gym.envs.terms import registry
 
-ID = "ce_gym/MiniCheetahVelocity-None-v0"
+ID = "ce_gym/MiniCheetahVelocity-v0"
 FILE = '''
 import casadi as ca
 import ce_gym

@@ -28,6 +28,7 @@ MAY_IMPORT = {
     "policies": {"model"},
     "viewer": {"model", "dynamics", "sim", "envs", "policies"},
     "new_robot": {"model", "dynamics", "viewer"},
+    "new_project": {"model", "envs", "learn"},
     "identify": {"model", "dynamics", "compile", "sim", "viewer"},
     "learn": {"model", "dynamics", "compile", "export", "envs", "adapters", "policies", "viewer"},
     "bench": {

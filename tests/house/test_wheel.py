@@ -20,9 +20,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from packaging.metadata import Metadata
 from packaging.requirements import Requirement
 from pages import ROOT, blocks, commands, links
 
+import ce_gym
 from ce_gym.viewer import Rollout
 
 pytestmark = pytest.mark.slow
@@ -90,6 +92,21 @@ def test_wheel_has_all_code_and_assets_and_is_small(built: Path):
     assert names == code | settings | {f"ce_gym/{name}" for name in sources("assets")}
     for kind in ("mini_cheetah/mini_cheetah.urdf", "policies/mini_cheetah_velocity_exact/policy.npz"):
         assert f"ce_gym/assets/{kind}" in names
+
+
+def test_metadata_is_valid(built: Path):
+    """As PyPI checks it; the version is the same in all files that state it."""
+    (metadata,) = (text for name, text in files_of(only(built, "*.whl")).items() if name.endswith("/METADATA"))
+    wheel = Metadata.from_email(metadata, validate=True)
+    with tarfile.open(only(built, "*.tar.gz")) as archive:
+        (member,) = (one for one in archive.getmembers() if one.name.count("/") == 1 and one.name.endswith("PKG-INFO"))
+        file = archive.extractfile(member)
+        assert file
+        assert Metadata.from_email(file.read(), validate=True).version == wheel.version
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    codemeta = json.loads((ROOT / "codemeta.json").read_text())
+    assert {ce_gym.__version__, citation["version"], codemeta["version"]} == {str(wheel.version)}
+    assert codemeta["description"] == wheel.summary
 
 
 def test_sdist_and_checkout_make_the_same_wheel(built: Path):

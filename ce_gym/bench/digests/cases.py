@@ -25,7 +25,7 @@ CONTROL_STEPS = 30
 EPISODE = 20
 """Time limit of an episode [control steps], so that every environment is also reset."""
 OUTPUTS = ("torque", "power", "contact_forces", "energy")
-QUICK_ENVIRONMENT = "ce_gym/MiniCheetahVelocity-Exact-v0"
+QUICK_ENVIRONMENT = "ce_gym/MiniCheetahVelocity-v0"
 
 SIMULATOR_VARIATIONS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "mini_cheetah": {
@@ -116,7 +116,8 @@ def cases(robots: Collection[str], kinds: Collection[str], quick: bool) -> list[
 
 def _is_quick(case: Case) -> bool:
     if case.kind == "environment":
-        return case.name == QUICK_ENVIRONMENT and case.dtype == "float64" and case.variation in ("", "randomised")
+        quick = case.name == QUICK_ENVIRONMENT and case.dtype == "float64" and case.variation in ("", "randomised")
+        return quick and case.level == "exact"
     plain = not case.variation
     return case.level == "exact" and (plain or (case.name == "mini_cheetah" and case.variation == "extrapolated"))
 
@@ -136,19 +137,20 @@ def _simulators(robots: Collection[str]) -> Iterator[Case]:
 
 def _environments(robots: Collection[str]) -> Iterator[Case]:
     for name, made_of in ce_gym.environment_ids().items():
-        robot, task, level = made_of["robot"], made_of["task"], made_of["transmission"]
-        if robot not in robots or not name.endswith(f"-{level.capitalize()}-v0"):
+        robot, task = made_of["robot"], made_of["task"]
+        if robot not in robots or made_of["transmission"] != "exact":
             continue
-        for dtype in DTYPES if task == "velocity" else ():
-            yield Case("environment", name, level, dtype)
-            yield Case("environment", name, level, dtype, "airborne", {"contacts": ()})
-        if robot != "mini_cheetah" or level != "exact":
+        for level in LEVELS if task == "velocity" else ():
+            for dtype in DTYPES:
+                yield Case("environment", name, level, dtype)
+                yield Case("environment", name, level, dtype, "airborne", {"contacts": ()})
+        if robot != "mini_cheetah":
             continue
         if task != "velocity":
-            yield Case("environment", name, level)
+            yield Case("environment", name, "exact")
             continue
         for variation, arguments in ENVIRONMENT_VARIATIONS.items():
-            yield Case("environment", name, level, "float64", variation, arguments)
+            yield Case("environment", name, "exact", "float64", variation, arguments)
 
 
 def _around(rng: np.random.Generator, centre: Any, width: float, *shape: int) -> NDArray:
@@ -212,9 +214,8 @@ def _target(sim: ce_gym.Simulator) -> tuple[NDArray, float]:
 
 def _environment(case: Case) -> Arrays:
     rng = np.random.default_rng(3)
-    envs = gymnasium.make_vec(
-        case.name, num_envs=NUM_ENVS, dtype=case.dtype, max_episode_steps=EPISODE, **case.arguments
-    )
+    arguments = {"transmission": case.level, "dtype": case.dtype, "max_episode_steps": EPISODE, **case.arguments}
+    envs = gymnasium.make_vec(case.name, num_envs=NUM_ENVS, **arguments)
     steps = [_named(envs.reset(seed=7)[0])]
     for _ in range(CONTROL_STEPS):
         shape = envs.action_space.shape or ()

@@ -1,0 +1,1 @@
+"""`python -m ce_gym project`: a package of one's own with a robot and a task."""
