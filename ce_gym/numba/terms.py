@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
+from itertools import accumulate, pairwise
 from types import FunctionType
 from typing import Any
 
 import numpy as np
 from numba import cfunc, njit, types
 from numba.core.dispatcher import Dispatcher
-from numba.core.errors import NumbaError
+from numba.core.errors import NumbaError, UnsupportedBytecodeError
 from numba.np.numpy_support import carray
 
 from ce_gym.compile import lane_count
@@ -66,11 +67,17 @@ class NjitTerm:
             dtype: "float64" or "float32" of the buffers.
 
         Raises:
-            ValueError: numba cannot compile the function, or the function returns another type; one line.
+            ValueError: numba cannot compile the function, the function returns another type, or a parameter is not
+                numeric; one line.
         """
         _, *defaults = self.__signature__.parameters.values()
-        values = [parameters.get(default.name, default.default) for default in defaults]
-        constants = [tuple(value) if isinstance(value, list) else value for value in values]
+        constants = []
+        for name, default in ((parameter.name, parameter.default) for parameter in defaults):
+            value = parameters.get(name, default)
+            if np.ndim(value) > 1 or np.asarray(value).dtype.kind not in "biuf":
+                expected = "a number or a list of numbers"
+                raise ValueError(f"{self.kind} term {self.__name__!r}: {name}={value!r}; expected {expected}")
+            constants.append(tuple(value) if np.ndim(value) else value)
         return _compiled(self.kind, self.function, shapes, dtype, *constants)
 
 
@@ -79,7 +86,7 @@ def _compiled(kind: str, function: Any, shapes: tuple[tuple[int, ...], ...], dty
     place, term = f"{kind} term {function.__name__!r}", _of_one_array(function, shapes, constants)
     try:
         returned = types.unliteral(term.compile((types.float64[::1],)) and term.nopython_signatures[0].return_type)
-    except NumbaError as error:
+    except (NumbaError, UnsupportedBytecodeError) as error:
         raise ValueError(f"{place}: {_first_message(error)}") from error
     if not isinstance(returned, types.Boolean | types.Integer | types.Float if kind == "reward" else types.Boolean):
         raise ValueError(f"{place} returns {returned}; expected {EXPECTED[kind]}")
@@ -97,42 +104,22 @@ def _compiled(kind: str, function: Any, shapes: tuple[tuple[int, ...], ...], dty
 
 def _of_one_array(function: Any, shapes: tuple[tuple[int, ...], ...], constants: tuple[Any, ...]) -> Any:
     """Return a function as a function of one array that holds all of its arrays."""
-
-    @njit
-    def call(row, *arrays):
-        return function(*(arrays + constants))
-
-    end = sum(map(math.prod, shapes))
-    for shape in reversed(shapes):
-        end -= math.prod(shape)
-        call = _with_part(call, end, shape)
-
-    @njit
-    def whole(row):
-        return call(row)
-
-    return whole
+    ends = accumulate(map(math.prod, shapes), initial=0)
+    arguments = [f"row[{a}:{b}].reshape({shape})" for (a, b), shape in zip(pairwise(ends), shapes, strict=True)]
+    names = {f"constant_{i}": constant for i, constant in enumerate(constants)}
+    scope = {"function": function, **names}
+    exec(f"def whole(row): return function({', '.join([*arguments, *names])})", scope)
+    return njit(scope["whole"])
 
 
-def _with_part(call: Any, start: int, shape: tuple[int, ...]) -> Any:
-    """Return a function that adds a part of the array to the arguments of `call`."""
-    end = start + math.prod(shape)
-
-    @njit
-    def add(row, *arrays):
-        return call(row, *(arrays + (row[start:end].reshape(shape),)))
-
-    return add
-
-
-def _first_message(error: NumbaError) -> str:
+def _first_message(error: Exception) -> str:
     """Return what numba says about the innermost function, in one line."""
     lines = [line.strip() for line in str(error).splitlines() if not line.startswith("Failed in")]
     ends = [i for i, line in enumerate(lines) if line.startswith(("There are", "During", "File"))]
     return " ".join(" ".join(lines[: min(ends, default=1)]).split())
 
 
-def reward(function: Callable[..., float]) -> Any:
+def reward(function: Any) -> Any:
     """Add a reward term under the function's name; the kernels of environments on the CPU call the function.
 
     Args:
@@ -147,6 +134,6 @@ def reward(function: Callable[..., float]) -> Any:
     return registry.reward(NjitTerm("reward", function)).function
 
 
-def termination(function: Callable[..., bool]) -> Any:
+def termination(function: Any) -> Any:
     """Add a condition that ends an episode: a function as for `reward` that returns a bool."""
     return registry.termination(NjitTerm("termination", function)).function

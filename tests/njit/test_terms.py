@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import sys
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -95,13 +96,13 @@ def test_copies_and_single_precision():
     add_njit_terms()
     kept = {dtype: results(gymnasium.make_vec, 3, 5, num_envs=3, dtype=dtype) for dtype in ("float64", "float32")}
     np.testing.assert_allclose(kept["float64"][2], kept["float32"][2], rtol=1e-3)
-    env = gymnasium.make(ID, **USED).unwrapped
+    env: Any = gymnasium.make(ID, **USED).unwrapped
     env.reset(seed=0)
     again = copy.deepcopy(env)
     np.testing.assert_equal(env.step(np.zeros(12)), again.step(np.zeros(12)))
     assert env.symmetry is None
     assert [block["name"] for block in env.policy_spec()["observation"]["blocks"]][-1] == "last_action"
-    with pytest.raises(ValueError, match="state lacks.*termination_low"):
+    with pytest.raises(ValueError, match="termination_low is an @njit function; expected"):
         env.look(env.state())
     with pytest.raises(ValueError, match=r"with terms that are @njit functions; expected traced terms"):
         env.differentiable()
@@ -124,7 +125,7 @@ def parallel(q):
 @pytest.mark.parametrize(
     ("add", "message"),
     [
-        (lambda: reward(3), "reward term 3; expected a function"),
+        (lambda: reward("q[2]"), r"reward term 'q\[2\]'; expected a function"),
         (lambda: reward(lambda width=1.0: width), r"arguments \(width=1.0\); expected names of properties"),
         (lambda: reward(lambda *q: 1.0), r"arguments \(\*q\)"),
         (lambda: reward(numba.njit(parallel=True)(parallel)), "parallel=True; expected @njit without it"),
@@ -141,9 +142,12 @@ def test_functions_that_cannot_be_terms(add, message):
     [
         (lambda speed: 1.0, "no attribute 'speed' of TermContext"),
         (lambda kinematics: 1.0, "argument 'kinematics': Kinematics; expected a property with numbers"),
-        (lambda contact_forces: 1.0, "contact_forces are not computed; expected contact_forces=True"),
+        (lambda contact_forces: 1.0, "contact_forces is not computed; expected contact_forces=True"),
+        (lambda motor_torque: 1.0, "motor_torque is not computed; expected the observation 'motor_torques'"),
         (lambda q: q, r"returns array\(float64, 1d, C\); expected one float"),
         (lambda q: 1j * q[0], "returns complex128; expected one float"),
+        (lambda q, name="FL": q[0], "name='FL'; expected a number or a list of numbers"),
+        (lambda q: q[0] if q[1] > 0 else None, "returns OptionalType"),
         (lambda q: q.speed, "Unknown attribute 'speed' of type array"),
     ],
 )

@@ -142,8 +142,6 @@ class TermContext:
     @property
     def contact_forces(self) -> SX:
         """Force on each contact in the last sub-step, in the world [N], shape (3, n_contacts)."""
-        if "contact_forces" not in self._values:
-            raise TypeError("contact_forces are not computed; expected contact_forces=True in the environment")
         return ca.reshape(self._values["contact_forces"], 3, -1)
 
     @property

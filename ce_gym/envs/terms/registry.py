@@ -57,6 +57,11 @@ OWN: dict[str, dict[str, Function]] = {
     "termination": _functions_of(terminations),
     "metric": _functions_of(metrics) | _functions_of(outcomes),
 }
+ON_REQUEST = {
+    "contact_forces": "contact_forces=True in the environment",
+    "motor_torque": "the observation 'motor_torques' in the task",
+}
+"""Properties of `TermContext` that only some environments have, and the argument that adds each."""
 _added: dict[str, dict[str, Function]] = {kind: {} for kind in OWN}
 
 
@@ -159,6 +164,8 @@ def _advice(error: Exception, s: TermContext) -> str:
     if isinstance(error, KeyError):
         bodies = [body.name for body in s.mechanism.robot.bodies]
         key = str(error.args[0]) if error.args else ""
+        if key in ON_REQUEST:
+            return f"{key} is not computed; expected {ON_REQUEST[key]}"
         return key if "has no body" in key else f"no key {key!r}; bodies are {listed_names(key, bodies)}"
     if "truth value" in str(error):
         return "a condition on a traced value (Python's if, and, or, min, max); expected ca.if_else, ca.fmin, ca.fmax"
