@@ -202,10 +202,12 @@ class BaseEnv(EzPickle):
             end the episode, shape (n,).
 
         Raises:
-            ValueError: A part of the state that the terms read is missing.
+            ValueError: A part of the state that the terms read is missing, or a termination is an `@njit` function.
         """
         function = self._observation_function
         names = function.name_in()
+        if called := [name for name in names if name in self.batch.program.stages.njit_values]:
+            raise ValueError(f"{self.task}: {called[0]} is an @njit function; expected terms written with CasADi")
         if missing := [name for name in names if name not in state]:
             raise ValueError(f"{self.task}: the state lacks {', '.join(missing)}; expected all of {', '.join(names)}")
         *blocks, failed = function.call([ca.DM(np.asarray(state[name], float).T) for name in names])

@@ -20,6 +20,7 @@ from ce_gym.numba.quantities import (
     quantity,
 )
 from ce_gym.numba.stepper import Memory, Robots, set_state, stepper
+from ce_gym.numba.terms import reward, termination
 
 __all__ = [
     "Controller",
@@ -35,6 +36,8 @@ __all__ = [
     "mass_matrix",
     "operational_space_inertia",
     "quantity",
+    "reward",
     "set_state",
     "stepper",
+    "termination",
 ]

@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "dynamics": {"model", "compile"},  # `Model` runs kernels
     "export": {"model", "dynamics"},
     "sim": {"model", "dynamics", "compile"},
-    "numba": {"model", "dynamics", "compile", "sim"},
+    "numba": {"model", "dynamics", "compile", "sim", "envs"},
     "envs": {"model", "dynamics", "compile", "sim"},
     "diagnostics": {"model", "dynamics", "compile", "sim", "envs"},
     "adapters": {"model", "envs", "policies"},

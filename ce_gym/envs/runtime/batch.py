@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -81,6 +81,8 @@ class TaskBatch(Batch):
     ) -> None:
         super().__init__(program.schema.values(), num_envs, dtype, device, program.field, num_threads)
         self.program, self.fused = program, device.fuses
+        self._njit = self._compiled_terms()
+        self._addresses = {name: function.address for name, function in self._njit.items()}
         key = f"{kernel_key(program)} {device.joint_space}"
         kind = "fused step" if self.fused else "environment"
         self._step_kernel = device.kernel(f"{kind} {key}", lambda: programs(program, device), dtype)
@@ -94,6 +96,34 @@ class TaskBatch(Batch):
         self._kept_if_ignored = (*curriculum, "failures")
         keys = self.arrays["keys"]
         self._streams = {"keys": keys if self.fused else keys.view(np.uint64), "counters": self.arrays["counters"]}
+
+    def _compiled_terms(self) -> dict[str, Any]:
+        """Return the C functions of the terms that are `@njit` functions, by key.
+
+        Raises:
+            ValueError: A function cannot be compiled or returns another type, or the device is a GPU.
+        """
+        program, functions = self.program, {}
+        for term in program.njit_terms:
+            if self.fused:
+                expected = "device='cpu', or the term written with CasADi operations, see ce_gym.reward"
+                given = f"an @njit function on device {self.place.name!r}"
+                raise ValueError(f"{term.kind} term {term.name!r}: {given}; expected {expected}")
+            shapes, function = program.stages.njit_shapes[term.key], cast("Any", term.function)
+            functions[term.key] = function.compiled(shapes, term.parameters, self.dtype)
+        return functions
+
+    def _check_values(self, name: str, values: Array, exempt: Array) -> None:
+        """Check the values of an `@njit` term, except for diverged robots and those that are reset next.
+
+        Raises:
+            ValueError: A value is not finite; one line.
+        """
+        wrong = np.flatnonzero(~(np.isfinite(values) | exempt))
+        if wrong.size:
+            kind, term = name.split("_", 1)
+            place = f"{kind} term {term!r}: {values[wrong[0]]:g} for robot {wrong[0]}"
+            raise ValueError(f"{place}; expected a finite number, and no exception in the function")
 
     def seed(self, keys: Array, mask: Array | None = None) -> None:
         """Restart random streams and curricula.
@@ -147,13 +177,16 @@ class TaskBatch(Batch):
         rows = {name: self.place.empty(shape, dtype) for name, shape, dtype in self._results}
         kept = {name: self.rows(name) for name in self._kept_if_ignored} if ignored is not None else {}
         self.n_changes += 1
-        self._run(self._step_kernel, {**rows, "action_in": action}, {"n_substeps": self.program.task.n_substeps})
+        integers = {"n_substeps": self.program.task.n_substeps, **self._addresses}
+        self._run(self._step_kernel, {**rows, "action_in": action}, integers)
         if not self.fused:
             self.arrays["counters"] += 1 if ignored is None else ~ignored
         for name, values in kept.items():
             self.write(name, values, ignored)
         outcome, n = rows["outcome"], len(OUTCOME)
         flags = (outcome[:, 1:n] > 0.5).T
+        for name in self._njit:
+            self._check_values(name, rows[name][:, 0], flags[2] if ignored is None else flags[2] | ignored)
         observation = final = self.arrays["observation"] = rows["observation"]
         if self.fused:
             final = rows["final_observation"]

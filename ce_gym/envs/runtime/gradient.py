@@ -50,6 +50,7 @@ class ControlStepGradient:
         for unsupported, argument, expected in (
             (program.ground is not None, f"terrain {task.terrain['kind']!r}", "'flat'"),
             (task.latency[1] > 0, f"latency={task.latency}", "(0, 0)"),
+            (program.njit_terms, "terms that are @njit functions", "traced terms"),
             ("motor_torque" in program.schema, "observation 'motor_torques'", "observations without it"),
             (task.method != "euler", f"method={task.method!r}", "'euler'"),
         ):

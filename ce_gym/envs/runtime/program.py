@@ -13,7 +13,7 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
-from ce_gym.compile import Buffer, Call, Lookup, Program, Repeat, Step
+from ce_gym.compile import Buffer, Call, Foreign, Lookup, Program, Repeat, Step
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.runtime.spec import TaskSpec
 from ce_gym.envs.runtime.stages import OUTCOME, Stages
@@ -133,12 +133,24 @@ class TaskProgram(TaskSpec):
             buffers += [Buffer("target", targets, "scratch")]
             steps = (Call(act, ("action_in",), ("clipped", "target")), *physics)
         look_ups, ground_buffers = self._ground_look_ups(begins=False)
-        steps = (*steps, *look_ups, evaluate)
+        njit_steps, njit_buffers = self._njit_steps()
+        steps = (*steps, *look_ups, *njit_steps, evaluate)
         if fused:
             x = SX.sym("observation", size)
             steps = (*steps, Call(ca.Function("keep", [x], [x]), ("observation",), ("final_observation",)))
             buffers.append(Buffer("final_observation", size, "rows_out", "float32"))
-        return self._program("environment", [*buffers, *ground_buffers], steps)
+        return self._program("environment", [*buffers, *ground_buffers, *njit_buffers], steps)
+
+    def _njit_steps(self) -> tuple[tuple[Step, ...], list[Buffer]]:
+        """Return the steps that call the user's `@njit` terms, whose addresses are run-time integers; see `Foreign`."""
+        if not self.njit_terms:
+            return (), []
+        keys, buffers = [term.key for term in self.njit_terms], []
+        inputs = self.stages.njit_inputs()
+        for key in keys:
+            size = inputs.function.numel_out(inputs.outputs.index(f"{key}_inputs"))
+            buffers += [Buffer(f"{key}_inputs", size, "scratch"), Buffer(key, 1, "rows_out", "float64")]
+        return (inputs, *[Foreign(key, (f"{key}_inputs", key)) for key in keys]), buffers
 
     def reset_program(self) -> Program:
         """Return the program that starts new episodes where `chosen` is 1."""

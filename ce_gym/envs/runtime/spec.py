@@ -68,6 +68,11 @@ class TaskSpec:
         return [term for terms in kinds for term in terms.values()]
 
     @property
+    def njit_terms(self) -> list[Term]:
+        """Rewards and terminations that are `@njit` functions."""
+        return [term for term in self.terms if term.inputs]
+
+    @property
     def n_actions(self) -> int:
         """Length of an action."""
         return len(self.actions.moved)

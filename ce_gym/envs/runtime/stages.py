@@ -49,6 +49,8 @@ class Stages:
         block_sizes: Length of each observation block by name; the critic's own blocks are last.
         ground_values: Symbols of the ground heights and slopes that the task and its terms look up, by name.
         grids: Grid of each look-up of terms, by name.
+        njit_values: Symbols of the values of terms that are `@njit` functions, by key of the term.
+        njit_shapes: Shapes of the inputs of each of these terms, by key.
     """
 
     def __init__(self, spec: TaskSpec, rows: Mapping[str, Row]) -> None:
@@ -59,19 +61,41 @@ class Stages:
         self.commands = Commands(self.task, spec.curriculum)
         self.block_sizes: dict[str, int] = {}
         self.grids: dict[str, Grid] = {}
+        self.njit_values = {term.key: SX.sym(term.key) for term in spec.njit_terms}
+        self.njit_shapes: dict[str, tuple[tuple[int, ...], ...]] = {}
         self._places: dict[str, SX] = {}
         sampler, action = Sampler(), SX.sym("clipped", spec.n_actions)
         self._evaluation = self._evaluate(action, sampler)
-        self._inputs = self.state | self.ground_values | {"clipped": action, "draws": sampler.symbols}
+        inputs = {"clipped": action, "draws": sampler.symbols}
+        self._inputs = self.state | self.ground_values | self.njit_values | inputs
+        self._njit_inputs = self._trace_njit_inputs(action)
 
     def evaluate(self) -> tuple[Call, int]:
         """Return the stage that follows the sub-steps."""
         return _call("evaluate", self._inputs, self._evaluation), self._inputs["draws"].numel()
 
+    def njit_inputs(self) -> Call:
+        """Return the call that writes the inputs of `@njit` functions as `<key>_inputs`, and nan as their values."""
+        return _call("njit_inputs", self._inputs, self._njit_inputs)
+
+    def _trace_njit_inputs(self, action: SX) -> dict[str, SX]:
+        results = {}
+        s = self.context(self._before_evaluation(action))
+        for term in self.spec.njit_terms:
+            values = term.trace_inputs(s)
+            self.njit_shapes[term.key] = tuple(x.shape if x.shape[1] != 1 else (x.shape[0],) for x in values)
+            results[f"{term.key}_inputs"] = ca.vertcat(*[ca.vec(x.T) for x in values])  # in the order of numpy
+            results[term.key] = SX(np.nan)
+        return results
+
+    def _before_evaluation(self, action: SX) -> dict[str, SX]:
+        """Return the values that terms read after the sub-steps, by name."""
+        return self.state | self.ground_values | {"action": action, "previous_action": self.state["action"]}
+
     def _evaluate(self, action: SX, sampler: Sampler) -> dict[str, SX]:
         """Trace the buffers that a control step writes after its sub-steps, by name, in the order of the stages."""
         spec, state = self.spec, self.state
-        values = state | self.ground_values | {"action": action, "previous_action": state["action"]}
+        values = self._before_evaluation(action)
         s = self.context(values)
         after = {"action": action, "elapsed": state["elapsed"] + 1, "clock": state["clock"] + 1}
 
@@ -176,18 +200,18 @@ class Stages:
         """Trace state buffers -> each block of the policy's observation, without noise or clipping, and `failed`."""
         s = self.context(self.state | {"previous_action": self.state["action"]})
         blocks = {name: term(s) for name, term in self.spec.observation_terms.items()} | {"failed": self._failed(s)}
-        return traced("observe", _used(self.state, blocks), blocks)
+        return traced("observe", _used(self.state | self.njit_values, blocks), blocks)
 
     def terms_function(self, terms: Mapping[str, Term]) -> ca.Function:
         """Trace state buffers and `previous_action` -> the values of terms, stacked."""
-        inputs = self.state | {"previous_action": SX.sym("previous_action", self.spec.n_actions)}
+        inputs = self.state | {"previous_action": SX.sym("previous_action", self.spec.n_actions)} | self.njit_values
         s = self.context(inputs)
         values = {"values": ca.vertcat(SX(0, 1), *[term(s) for term in terms.values()])}
         return traced("terms", _used(inputs, values), values)
 
     def context(self, values: Mapping[str, SX]) -> TermContext:
         """Return the context in which terms read the values of state buffers, by name."""
-        spec, values = self.spec, dict(values)
+        spec, values = self.spec, self.njit_values | dict(values)
         if "draw" in values:
             values["scaled_parameters"] = 2 * values["draw"] - 1
         if "load" in values:
@@ -199,7 +223,8 @@ class Stages:
         """A text that identifies the terms that users have added, for cache keys; empty without such terms."""
         if not any(term.added for term in self.spec.terms):
             return ""
-        results = {f"{name}_result": x for name, x in (self._evaluation | self._places).items()}
+        everything = self._evaluation | self._places | self._njit_inputs
+        results = {f"{name}_result": x for name, x in everything.items()}
         function = traced("user_terms", self._inputs, results)
         return f"{function.serialize()} {list(self.rows.values())!r} {self.grids!r}"
 

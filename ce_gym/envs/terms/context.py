@@ -139,6 +139,16 @@ class TermContext:
     terrain_level = _buffer("level", "Terrain level of the episode; 0 on flat ground.", SX(0))
     times_grown = _buffer("grown", "Growth steps of the command range, see `ce_gym.envs.task.curriculum`.", SX(0))
 
+    @property
+    def contact_forces(self) -> SX:
+        """Force on each contact in the last sub-step, in the world [N], shape (3, n_contacts)."""
+        return ca.reshape(self._values["contact_forces"], 3, -1)
+
+    @property
+    def _njit_value(self) -> SX:
+        """Value that an `@njit` function returns, see `ce_gym.numba.reward`."""
+        return self._values[self.term.replace("__", "_")]
+
     def ground_under(self, name: str, places: SX) -> SX:
         """Return heights of the ground under places [m], shape (n,); zeros on flat ground.
 

@@ -11,10 +11,14 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, TypeVar
+
+import casadi as ca
+import numpy as np
 
 from ce_gym.dynamics.algebra.spatial import SX
 from ce_gym.envs.terms import (
@@ -53,6 +57,11 @@ OWN: dict[str, dict[str, Function]] = {
     "termination": _functions_of(terminations),
     "metric": _functions_of(metrics) | _functions_of(outcomes),
 }
+ON_REQUEST = {
+    "contact_forces": "contact_forces=True in the environment",
+    "motor_torque": "the observation 'motor_torques' in the task",
+}
+"""Properties of `TermContext` that only some environments have, and the argument that adds each."""
 _added: dict[str, dict[str, Function]] = {kind: {} for kind in OWN}
 
 
@@ -84,20 +93,53 @@ class Term:
         """Whether a metric reports its final value instead of its mean over the episode."""
         return self.function.__module__ == outcomes.__name__
 
+    @property
+    def key(self) -> str:
+        """Kind and name, the name of the term in kernels."""
+        return f"{self.kind}_{self.name}".replace("__", "_")  # CasADi's rule for names
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Properties of `TermContext` that an `@njit` function takes; empty for a traced term."""
+        return getattr(self.function, "inputs", ())
+
     def __call__(self, s: TermContext) -> SX:
         """Trace the term.
 
         Raises:
             ValueError: The function cannot be traced; one line.
         """
+        with self._tracing(s):
+            value = self.function(s, **self.parameters)
+            if value is None:
+                raise TypeError("returns None; expected a CasADi expression")
+            return SX(value)
+
+    def trace_inputs(self, s: TermContext) -> list[SX]:
+        """Trace the inputs of an `@njit` function; a list has a row for each entry.
+
+        Raises:
+            ValueError: An input does not exist, or is not an array; one line.
+        """
+        values = []
+        with self._tracing(s):
+            for name in self.inputs:
+                value = getattr(s, name)
+                if isinstance(value, list):
+                    value = ca.horzcat(SX(), *value).T
+                if not isinstance(value, SX | np.ndarray | float):
+                    raise TypeError(f"argument {name!r}: {type(value).__name__}; expected a property with numbers")
+                values.append(ca.densify(SX(value)))
+        return values
+
+    @contextmanager
+    def _tracing(self, s: TermContext) -> Iterator[None]:
+        """Name the term that is being traced, also in errors."""
         s.term = f"{self.kind}_{self.name}"
         try:
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", category=FutureWarning)  # CasADi's, of numpy's functions
-                value = self.function(s, **self.parameters)
-            if value is None:
-                raise TypeError("returns None; expected a CasADi expression")
-            return SX(value)
+                yield
         except (RuntimeError, NotImplementedError, TypeError, KeyError, AttributeError) as error:
             raise ValueError(f"{self.kind} term {self.name!r}: {_advice(error, s)}") from error
 
@@ -122,6 +164,8 @@ def _advice(error: Exception, s: TermContext) -> str:
     if isinstance(error, KeyError):
         bodies = [body.name for body in s.mechanism.robot.bodies]
         key = str(error.args[0]) if error.args else ""
+        if key in ON_REQUEST:
+            return f"{key} is not computed; expected {ON_REQUEST[key]}"
         return key if "has no body" in key else f"no key {key!r}; bodies are {listed_names(key, bodies)}"
     if "truth value" in str(error):
         return "a condition on a traced value (Python's if, and, or, min, max); expected ca.if_else, ca.fmin, ca.fmax"
@@ -199,5 +243,8 @@ def _add(kind: str, function: _F) -> _F:
     for parameter, default in parameters_of(function).items():
         if default is inspect.Parameter.empty:
             raise ValueError(f"{kind} term {name!r}: parameter {parameter!r} has no default; expected one")
+    if hasattr(function, "py_func"):
+        expected = "CasADi operations without @njit, or ce_gym.numba.reward and ce_gym.numba.termination"
+        raise ValueError(f"{kind} term {name!r}: an @njit function; expected {expected}")
     _added[kind][name] = function
     return function
