@@ -65,7 +65,7 @@ def page(
     return filled(
         "player",
         title or " / ".join(dict.fromkeys(Path(rollout.robot).stem for rollout in rollouts)),
-        scripts=("belts", "graph", "plots", "player"),
+        scripts=("belts", "overlays", "graph", "plots", "player"),
         constants={
             "COMMANDS": packed_commands(build_scene(runs, spacing=spacing)),
             "DATA": _data(runs, plot, ghosts=spacing == 0),

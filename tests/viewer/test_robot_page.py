@@ -1,0 +1,174 @@
+"""The page of a robot file: sliders move independent joints, dependent joints follow the constraints."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import PROGRAM, Chromium
+
+from ce_gym.__main__ import main
+from ce_gym.dynamics import Model
+from ce_gym.model import load_robot
+from ce_gym.model.description import Joint
+from ce_gym.viewer.robot_page import RobotPage
+from ce_gym.viewer.stream import serving
+
+pytest.importorskip("meshcat")
+
+PUP = Path(__file__).parents[1] / "data" / "own_robot" / "pup.urdf"
+WHEEL = """<robot name="cart"><link name="box"><inertial><mass value="2"/>
+<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
+<joint name="axle" type="continuous"><parent link="box"/><child link="wheel"/><axis xyz="0 1 0"/></joint>
+<link name="wheel"><inertial><mass value="1"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>
+<visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>"""
+
+
+def ask(page: RobotPage, values: list[float]) -> dict:
+    """Move the sliders, and return the state that the page receives."""
+    page.receive(json.dumps({"do": "move", "values": values}).encode())
+    page.update()
+    return page.state()
+
+
+@pytest.mark.parametrize("name", ["cassie", "tello", "g1"])
+def test_dependent_joints_meet_the_constraints(name: str) -> None:
+    page = RobotPage(load_robot(name))
+    model, robot = page.model, page.model.robot
+    assert page.q(page.standing) == pytest.approx(model.standing_q, abs=1e-12)
+    low, high = np.array([(slider["low"], slider["high"]) for slider in page.sliders]).T
+    values = page.standing + 0.1 * (0.5 * (low + high) - page.standing)
+    state = ask(page, values.tolist())
+    assert state["notice"] == ""
+    assert state["values"] == pytest.approx(values, abs=1e-5)
+    dependent = dict(zip([n for n in robot.joints if n not in robot.rows], state["dependent"], strict=True))
+    assert len(dependent) == len(robot.joints) - len(robot.independent) > 0
+    q = page.q(page.values)
+    span, _ = model.spanning(q, np.zeros(model.nv))
+    at_rest, _ = model.spanning(model.standing_q, np.zeros(model.nv))
+    for joint, value in dependent.items():
+        row = robot.spanning_rows[joint][0][0]
+        assert value == pytest.approx(span[row], abs=1e-5)
+    assert np.abs(span - at_rest).max() > 0.05
+    assert model.from_spanning(span, np.zeros(robot.layout.nv + len(dependent)))[0] == pytest.approx(q, abs=1e-9)
+
+
+def test_a_slider_stops_where_a_loop_opens() -> None:
+    """Two cranks of 0.1 m, 0.1 m apart, with a coupler: it is taut before the crank has turned by half a turn."""
+    page = RobotPage(load_robot("tello"))
+    index = next(i for i, slider in enumerate(page.sliders) if slider["name"] == "left-shin-to-foot")
+    for slider in page.sliders:
+        slider["low"], slider["high"] = -20.0, 20.0
+    page._closes = lambda values: values[index] < 0.25  # type: ignore[method-assign]
+    target = page.standing.copy()
+    target[index] = 1.0
+    state = ask(page, target.tolist())
+    assert state["values"][index] == pytest.approx(0.25, abs=1e-4)
+    assert "do not close" in state["notice"]
+    assert ask(page, page.standing.tolist())["notice"] == ""
+    assert page.values == pytest.approx(page.standing)
+
+
+def test_values_beyond_the_range_are_clipped_and_other_messages_refused() -> None:
+    page = RobotPage(load_robot("mini_cheetah"))
+    high = [slider["high"] for slider in page.sliders]
+    assert ask(page, [99.0] * 12)["values"] == pytest.approx(high, abs=1e-5)
+    messages: list[dict] = [
+        {"do": "move", "values": [0.0] * 11},
+        {"do": "move", "values": [float("nan")] * 12},
+        {"do": "move", "values": ["0"] * 12},
+        {"do": "jump"},
+        {"do": "move", "speed": 1},
+    ]
+    for message in messages:
+        with pytest.raises(ValueError, match="expected"):
+            page.receive(json.dumps(message).encode())
+
+
+def test_a_robot_without_contacts_stands_on_its_lowest_shape_and_wheels_turn(tmp_path: Path) -> None:
+    page = RobotPage(load_robot(PUP))
+    assert page._origin[2] == pytest.approx(0.33, abs=0.02)  # thigh and shank of 0.16 m, foot of 0.02 m
+    assert "contacts" not in page.html().partition("const OVERLAYS")[0]
+    (tmp_path / "cart.urdf").write_text(WHEEL)
+    page = RobotPage(load_robot(tmp_path / "cart.urdf"))
+    (slider,) = page.sliders
+    assert (slider["name"], slider["link"], slider["limits"]) == ("axle", "wheel", [None, None])
+    assert (slider["low"], slider["high"]) == pytest.approx((-np.pi, np.pi))
+
+
+def test_a_ball_joint_has_three_sliders_of_its_rotation_vector(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    robot = load_robot("mini_cheetah")
+    bodies = [replace(b, joint=Joint("ball", position=(0.0, 1.0))) if b.name == "FL_hip_link" else b for b in robot.bodies]
+    del bodies
+
+
+@pytest.mark.parametrize("name", ["robot.urdf", "robot.yaml", "mini_cheetah"])
+def test_the_kind_of_file_decides(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("robot.urdf").write_text(PUP.read_text())
+    Path("robot.yaml").write_text("name: pup\nurdf: robot.urdf\nbase: floating\n")
+    served: list[tuple[str, bool]] = []
+
+    def record(page: RobotPage, verb: str, *, open_browser: bool) -> None:
+        served.append((page.model.robot.name, open_browser))
+
+    monkeypatch.setattr("ce_gym.viewer.stream.serve", record)
+    assert main(["view", name]) == main(["view", name, "--no-open"]) == 0
+    assert served == [("mini_cheetah" if name == "mini_cheetah" else "pup", opens) for opens in (True, False)]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Chromium]:
+    if PROGRAM is None:
+        pytest.skip("no Chromium here: install chromium (Debian's package) to run this")
+    with serving(RobotPage(load_robot("cassie"))) as url, Chromium(f"{url}#contacts") as browser:
+        browser.until("received > 0")
+        yield browser
+        assert not browser.errors
+
+
+@pytest.mark.slow
+def test_a_slider_moves_the_robot_and_its_loops(browser: Chromium) -> None:
+    model = Model("cassie")
+    names = list(model.robot.rows)[1:]
+    index = names.index("left_shin") if "left_shin" in names else 3
+    count = browser.run("received")
+    browser.run(f"sliders[{index}].value = STANDING[{index}] - 0.15; sliders[{index}].oninput()")
+    browser.until(f"received > {count} && Math.abs(state.values[{index}] - STANDING[{index}] + 0.15) < 1e-4")
+    q = model.standing_q.copy()
+    q[7 + index] -= 0.15
+    positions, _ = model.body_poses(q)
+    found = browser.run(
+        """(() => { viewer.scene.updateMatrixWorld(); const places = {}; node('/world/0').object.traverse(object => {
+            places[object.name] = node('/world').object.worldToLocal(object.getWorldPosition(new THREE.Vector3())).toArray();
+        }); return places; })()"""
+    )
+    for name, position in zip(model.body_names, positions, strict=True):
+        np.testing.assert_allclose(found[name], position, atol=2e-4, err_msg=name)
+    browser.run("find('standing').click()")
+    browser.until(f"Math.abs(state.values[{index}] - STANDING[{index}]) < 1e-4")
+    assert browser.run("find('dependent').rows.length") == len(model.robot.joints) - len(model.robot.independent)
+
+
+@pytest.mark.slow
+def test_boxes_show_overlays_and_the_centre_of_mass_is_the_model_s(browser: Chromium) -> None:
+    visible = "kind => overlayNodes(kind).every(object => object.visible)"
+    assert browser.run(f"({visible})('contacts')") is True  # by the address
+    for kind in ("frames", "inertia", "collision", "center"):
+        assert browser.run(f"({visible})('{kind}')") is False
+        browser.run(f"find('{kind}').click()")
+        assert browser.run(f"({visible})('{kind}')") is True
+    browser.settle()
+    model = Model("cassie")
+    found = browser.run("overlayNodes('center')[0].position.toArray()")
+    np.testing.assert_allclose(found, model.center_of_mass(np.array(browser_q(browser, model))), atol=2e-4)
+
+
+def browser_q(browser: Chromium, model: Model) -> np.ndarray:
+    """Return the positions that the page shows."""
+    return np.concatenate([model.standing_q[:7], browser.run("state.values")])
