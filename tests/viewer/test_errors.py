@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("view stand.npz --plot forward temperature", "no signal 'temperature' to plot; expected one of forward speed"),
         ("view stand.npz --html no/x.html", "no such folder"),
         ("view", "FILE"),
-        ("view nowhere.urdf", "nowhere.urdf: no such file"),
+        ("view nowhere.urdf", "nowhere.urdf: cannot be read"),
         ("view mini_cheetah stand.npz", "mini_cheetah: 2 files; expected a robot alone"),
         ("view mini_cheetah --html x.html", "mini_cheetah: --html is for rollouts and policies"),
         ("view mini_cheetah --env-arg terrain=stairs", "mini_cheetah: --env-arg is for rollouts and policies"),
