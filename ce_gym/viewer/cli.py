@@ -201,6 +201,7 @@ def _view_robot(args: argparse.Namespace) -> int:
     """Serve the page of a robot file; return the exit code."""
     from ce_gym.model import load_robot
     from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.preparing import Preparing
     from ce_gym.viewer.robot_page import RobotPage
     from ce_gym.viewer.stream import serve
 
@@ -212,7 +213,8 @@ def _view_robot(args: argparse.Namespace) -> int:
             name = option.replace("_", "-").removesuffix("s")
             raise ViewerError(f"{robot}: --{name} is for rollouts and policies; expected a robot without it")
     meshcat_code()
-    serve(RobotPage(load_robot(str(robot))), "view", open_browser=args.open is not False)
+    page = Preparing(robot.stem, lambda: RobotPage(load_robot(str(robot))))
+    serve(page, "view", open_browser=args.open is not False)
     return 0
 
 
@@ -244,12 +246,13 @@ def live(args: argparse.Namespace) -> int:
     from ce_gym.viewer.live.runner import Runner
     from ce_gym.viewer.live.setup import named
     from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.preparing import Preparing
     from ce_gym.viewer.stream import serve
 
     meshcat_code()  # a missing meshcat is reported before the compilation
     options = {name: getattr(args, name) for name in ("transmission", "ghost", "terrain")}
     setup = named(args.name, args.env or "", kwargs=dict(args.env_args), **options)
-    serve(Runner(setup, args.folder), "live", open_browser=args.open)
+    serve(Preparing(args.name, lambda: Runner(setup, args.folder)), "live", open_browser=args.open)
     return 0
 
 

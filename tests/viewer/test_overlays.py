@@ -105,6 +105,8 @@ def test_rotors_have_a_sensible_size() -> None:
     assert 1000 * np.pi * radius**4 * height / 2 == pytest.approx(0.01)  # kg m^2 about y
     np.testing.assert_allclose(np.array(disc.placement.rotation)[:, 2], [0, 1, 0])
     *links, rotor = robot.bodies
-    unknown = replace(rotor, inertial=Inertial(0.0, (0.0, 0.0, 0.0), ((0.0,) * 3,) * 3))
+    unknown = replace(
+        rotor, inertial=Inertial(0.0, (0.0, 0.0, 0.0), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    )
     (disc,) = rotor_discs(replace(robot, bodies=(*links, unknown))).values()
     assert disc.size[0] == pytest.approx(0.03 * 0.25)

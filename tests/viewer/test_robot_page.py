@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import threading
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,10 +15,10 @@ from chromium import PROGRAM, Chromium
 
 from ce_gym.__main__ import main
 from ce_gym.dynamics import Model
-from ce_gym.model import load_robot
-from ce_gym.model.description import Joint
+from ce_gym.model import RobotError, load_robot
+from ce_gym.viewer.preparing import Preparing
 from ce_gym.viewer.robot_page import RobotPage
-from ce_gym.viewer.stream import serving
+from ce_gym.viewer.stream import LivePage, serving
 
 pytest.importorskip("meshcat")
 
@@ -24,7 +26,8 @@ PUP = Path(__file__).parents[1] / "data" / "own_robot" / "pup.urdf"
 WHEEL = """<robot name="cart"><link name="box"><inertial><mass value="2"/>
 <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
 <joint name="axle" type="continuous"><parent link="box"/><child link="wheel"/><axis xyz="0 1 0"/></joint>
-<link name="wheel"><inertial><mass value="1"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>
+<link name="wheel"><inertial><mass value="1"/>
+<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>
 <visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>"""
 
 
@@ -117,12 +120,54 @@ def test_the_kind_of_file_decides(name: str, tmp_path: Path, monkeypatch: pytest
     Path("robot.yaml").write_text("name: pup\nurdf: robot.urdf\nbase: floating\n")
     served: list[tuple[str, bool]] = []
 
-    def record(page: RobotPage, verb: str, *, open_browser: bool) -> None:
-        served.append((page.model.robot.name, open_browser))
+    def record(page: LivePage, verb: str, *, open_browser: bool) -> None:
+        served.append((page.html().partition("<title>")[2].partition("</title>")[0], open_browser))
 
     monkeypatch.setattr("ce_gym.viewer.stream.serve", record)
     assert main(["view", name]) == main(["view", name, "--no-open"]) == 0
     assert served == [("mini_cheetah" if name == "mini_cheetah" else "pup", opens) for opens in (True, False)]
+
+
+def read(url: str) -> str:
+    with urllib.request.urlopen(url, timeout=10) as answer:
+        return answer.read().decode()
+
+
+def test_the_page_opens_before_the_robot_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ce_gym.viewer.preparing.GRACE", 0.01)
+    is_compiled = threading.Event()
+
+    def make() -> RobotPage:
+        assert is_compiled.wait(60)
+        return RobotPage(load_robot("mini_cheetah"))
+
+    page = Preparing("cheetah & co", make)
+    with serving(page) as url:
+        assert "compiling" in read(url)
+        assert "<h1>cheetah &amp; co</h1>" in read(url)
+        with urllib.request.urlopen(f"{url}events", timeout=60) as events:
+            is_compiled.set()
+            while b"data:" not in events.readline():
+                pass
+        assert "MeshCat.Viewer" in read(url)
+        page.receive(json.dumps({"do": "move", "values": [0.0] * 12}).encode())
+
+
+def test_errors_before_and_after_the_page_opens_reach_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(RobotError, match="nobody"):
+        Preparing("nobody", lambda: RobotPage(load_robot("nobody")))
+    monkeypatch.setattr("ce_gym.viewer.preparing.GRACE", 0.0)
+    is_open = threading.Event()
+
+    def fail() -> LivePage:
+        assert is_open.wait(60)
+        raise RobotError("robot.urdf: broken")
+
+    page = Preparing("late", fail)
+    with serving(page):
+        is_open.set()
+        with pytest.raises(RobotError, match="broken"):
+            page.wait()
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +192,8 @@ def test_a_slider_moves_the_robot_and_its_loops(browser: Chromium) -> None:
     positions, _ = model.body_poses(q)
     found = browser.run(
         """(() => { viewer.scene.updateMatrixWorld(); const places = {}; node('/world/0').object.traverse(object => {
-            places[object.name] = node('/world').object.worldToLocal(object.getWorldPosition(new THREE.Vector3())).toArray();
+            const place = object.getWorldPosition(new THREE.Vector3());
+            places[object.name] = node('/world').object.worldToLocal(place).toArray();
         }); return places; })()"""
     )
     for name, position in zip(model.body_names, positions, strict=True):
