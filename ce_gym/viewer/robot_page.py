@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ce_gym.dynamics.model import Model
+from ce_gym.dynamics.quantities.configurations import joint_range
 from ce_gym.model import Robot
 from ce_gym.model.arguments import check, is_number
 from ce_gym.model.options import one_of
@@ -50,6 +51,7 @@ class RobotPage(LivePage):
         self._origin = np.concatenate([standing[: layout.base_nq], self.model.neutral()[layout.base_nq :]])
         self.standing = self.model.difference(self._origin, standing)[self._base :]
         self.sliders = self._sliders()
+        self._summary = self.model.describe().splitlines()[0].partition(": ")[2]
         self.values = self._wanted = self.standing
         self._is_sent = False
 
@@ -60,7 +62,7 @@ class RobotPage(LivePage):
             joint = robot.body(name).joint
             for row, axis in zip(rows, (" x", " y", " z") if joint.type == "ball" else ("",), strict=False):
                 if row >= self._base:
-                    low, high = _range(joint.position, self.standing[row - self._base], joint.type)
+                    low, high = joint_range(joint, self.standing[row - self._base])
                     sliders.append({**_row(robot, name), "low": low, "high": high})
                     sliders[-1]["name"] += axis
         return sliders
@@ -78,7 +80,7 @@ class RobotPage(LivePage):
                 "SLIDERS": self.sliders,
                 "STANDING": self.standing.tolist(),
                 "DEPENDENT": [_row(robot, name) for name in dependent],
-                "SUMMARY": self.model.describe().splitlines()[0].partition(": ")[2],
+                "SUMMARY": self._summary,
             },
         )
 
@@ -162,14 +164,3 @@ def _row(robot: Robot, name: str) -> dict[str, Any]:
         "limits": [x if np.isfinite(x) else None for x in joint.position],
         "effort": joint.torque if np.isfinite(joint.torque) else None,
     }
-
-
-def _range(limits: tuple[float, float], standing: float, kind: str) -> tuple[float, float]:
-    """Return the range of a slider: the joint's limits, or half a turn or 1 m around the standing pose."""
-    if kind == "ball":
-        limit = min(np.pi, limits[1])
-        return -limit, limit
-    reach = 1.0 if kind == "prismatic" else np.pi
-    low, high = limits
-    low = low if np.isfinite(low) else min(standing, high) - reach
-    return float(low), float(high if np.isfinite(high) else max(standing, low) + reach)
