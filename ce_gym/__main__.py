@@ -35,6 +35,7 @@ WELCOME = """ce_gym: Gymnasium environments for legged robots with exact transmi
   python -m ce_gym new my_robot.urdf     write the YAML file that a robot of one's own needs, guesses marked
   python -m ce_gym project my_lab        write a package with a robot and a task of one's own
   python -m ce_gym inspect mini_cheetah  clusters and gears of a robot, errors of each transmission level
+  python -m ce_gym view my_robot.urdf    move the joints of a robot in a browser; contacts, frames, inertias
   python -m ce_gym inspect ENVIRONMENT   scalar operations of an environment's step, feature by feature
   python -m ce_gym train ENVIRONMENT     train a policy
   python -m ce_gym evaluate POLICY       errors, falls, motors and pushes of a policy

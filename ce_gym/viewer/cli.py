@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ce_gym.console import add_force_argument, examples, has_display, path
 from ce_gym.files import PAGE, check_output
+from ce_gym.model.assets import robots
 from ce_gym.model.mechanism import ELASTIC, LEVELS
 from ce_gym.policies import WHERE, add_env_arguments, find_policy, locate_policy, policy_name
 from ce_gym.viewer.errors import ViewerError
@@ -19,24 +20,35 @@ from ce_gym.viewer.errors import ViewerError
 if TYPE_CHECKING:
     from ce_gym.viewer.rollouts.rollout import Rollout
 
+ROBOT_FILES = (".urdf", ".xml", ".yaml", ".yml")
+"""Suffixes of robot files, see `load_robot`."""
+
 
 def add_view_command(subparsers: Any) -> None:
     """Add `view` to the subcommands of an argument parser."""
     parser = subparsers.add_parser(
         "view",
-        help="show recorded rollouts and policies in a browser",
+        help="show a robot file, recorded rollouts or policies in a browser",
         description="Show recorded rollouts or policies: write one self-contained HTML file (default) or a video, or "
-        "serve\nthe page on this machine until Ctrl-C.",
+        "serve\nthe page on this machine until Ctrl-C. Of a robot file, serve a page with sliders of the joints, and "
+        "overlays\nof contacts, frames, inertias, collision shapes and centre of mass.",
         epilog=examples(
-            "view walk.npz", "view exact.npz armature.npz --overlay", "view walk.npz --plot 'torque of FL_knee' reward"
+            "view my_robot.urdf",
+            "view walk.npz",
+            "view exact.npz armature.npz --overlay",
+            "view walk.npz --plot 'torque of FL_knee' reward",
         ),
     )
     parser.add_argument(
-        "rollouts", nargs="+", type=path, metavar="ROLLOUT", help=f"a recorded rollout (.npz); or a policy: {WHERE}"
+        "rollouts",
+        nargs="+",
+        type=path,
+        metavar="FILE",
+        help=f"a recorded rollout (.npz); a policy: {WHERE}; or one robot: a file (.urdf, .xml or .yaml) or a name",
     )
     parser.add_argument("--overlay", action="store_true", help="draw all in one place, all but the first as ghosts")
     add_env_arguments(parser)
-    _add_page_arguments(parser, "beside the first rollout, here for policies")
+    _add_page_arguments(parser, "beside the first rollout, here for policies", open_browser=None)
     parser.set_defaults(run=view)
 
 
@@ -137,8 +149,8 @@ def _at_least_one(text: str) -> int:
     return int(text)
 
 
-def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add the arguments for the target and the look of a page."""
+def _add_page_arguments(parser: argparse.ArgumentParser, default: str, *, open_browser: bool | None = False) -> None:
+    """Add the arguments for the target and the look of a page; `open_browser` is the default of `--open`."""
     target = parser.add_mutually_exclusive_group()
     target.add_argument("--html", type=path, metavar="FILE", help=f"HTML file to write (default: {default})")
     target.add_argument("--live", action="store_true", help="serve the page on this machine's loopback until Ctrl-C")
@@ -154,10 +166,10 @@ def _add_page_arguments(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument("--plot", nargs="+", default=[], metavar="SIGNAL", help="signals to plot first")
     parser.add_argument("--title", help="heading of the page (default: the robot's name)")
     add_force_argument(parser)
-    _add_open_argument(parser, default=False)
+    _add_open_argument(parser, default=open_browser)
 
 
-def _add_open_argument(parser: argparse.ArgumentParser, *, default: bool) -> None:
+def _add_open_argument(parser: argparse.ArgumentParser, *, default: bool | None) -> None:
     parser.add_argument(
         "--open", action=argparse.BooleanOptionalAction, default=default, help="open a browser, if there is a display"
     )
@@ -165,6 +177,8 @@ def _add_open_argument(parser: argparse.ArgumentParser, *, default: bool) -> Non
 
 def view(args: argparse.Namespace) -> int:
     """Run `view`; return its exit code."""
+    if any(map(_is_robot, args.rollouts)):
+        return _view_robot(args)
     from ce_gym.viewer.rollouts.driving import walk
     from ce_gym.viewer.rollouts.rollout import Rollout
 
@@ -176,6 +190,32 @@ def view(args: argparse.Namespace) -> int:
         for policy, file in zip(policies, args.rollouts, strict=True)
     ]
     return _present(rollouts, args, page, overlay=args.overlay)
+
+
+def _is_robot(file: Path) -> bool:
+    """Return whether a robot is meant: a file by its suffix, or the name of a robot of the package."""
+    return file.suffix.lower() in ROBOT_FILES or (str(file) in robots() and find_policy(file) is None)
+
+
+def _view_robot(args: argparse.Namespace) -> int:
+    """Serve the page of a robot file; return the exit code."""
+    from ce_gym.model import load_robot
+    from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.preparing import Preparing
+    from ce_gym.viewer.robot_page import RobotPage
+    from ce_gym.viewer.stream import serve
+
+    robot = next(filter(_is_robot, args.rollouts))
+    if len(args.rollouts) > 1:
+        raise ViewerError(f"{robot}: {len(args.rollouts)} files; expected a robot alone, show other files separately")
+    for option in ("html", "video", "overlay", "plot", "env", "env_args", "title"):
+        if getattr(args, option):
+            name = option.replace("_", "-").removesuffix("s")
+            raise ViewerError(f"{robot}: --{name} is for rollouts and policies; expected a robot without it")
+    meshcat_code()
+    page = Preparing(robot.stem, lambda: RobotPage(load_robot(str(robot))))
+    serve(page, "view", open_browser=args.open is not False)
+    return 0
 
 
 def play(args: argparse.Namespace) -> int:
@@ -206,12 +246,13 @@ def live(args: argparse.Namespace) -> int:
     from ce_gym.viewer.live.runner import Runner
     from ce_gym.viewer.live.setup import named
     from ce_gym.viewer.page.html import meshcat_code
+    from ce_gym.viewer.preparing import Preparing
     from ce_gym.viewer.stream import serve
 
     meshcat_code()  # a missing meshcat is reported before the compilation
     options = {name: getattr(args, name) for name in ("transmission", "ghost", "terrain")}
     setup = named(args.name, args.env or "", kwargs=dict(args.env_args), **options)
-    serve(Runner(setup, args.folder), "live", open_browser=args.open)
+    serve(Preparing(args.name, lambda: Runner(setup, args.folder)), "live", open_browser=args.open)
     return 0
 
 

@@ -34,7 +34,7 @@ class PageServer:
     """Serves one page at a free loopback port until it is closed.
 
     Args:
-        text: The page.
+        text: The page, or a function that returns it at each request.
         events: Returns the server-sent events of the address `events` for one browser; None for a page without.
         receive: Takes the body of each message posted to `messages`, in the thread of its connection; raises
             ValueError for an invalid message. None for a page that posts nothing.
@@ -43,10 +43,12 @@ class PageServer:
         url: Address of the page.
     """
 
-    def __init__(self, text: str, events: Events | None = None, receive: Receive | None = None) -> None:
+    def __init__(
+        self, text: str | Callable[[], str], events: Events | None = None, receive: Receive | None = None
+    ) -> None:
         path = f"/{secrets.token_urlsafe(16)}/"
         self._stop = threading.Event()
-        server = _Server((LOOPBACK, 0), _handler(text.encode("utf-8"), path, events, receive))
+        server = _Server((LOOPBACK, 0), _handler(text if callable(text) else lambda: text, path, events, receive))
         self.url = f"http://{LOOPBACK}:{server.server_port}{path}"
         self._thread = threading.Thread(target=_serve, args=(server, self._stop), daemon=True)
         self._thread.start()
@@ -107,7 +109,9 @@ class _Server(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
 
-def _handler(body: bytes, path: str, events: Events | None, receive: Receive | None) -> type[BaseHTTPRequestHandler]:
+def _handler(
+    text: Callable[[], str], path: str, events: Events | None, receive: Receive | None
+) -> type[BaseHTTPRequestHandler]:
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"  # posts of a page share a connection
         timeout = PATIENCE
@@ -118,6 +122,7 @@ def _handler(body: bytes, path: str, events: Events | None, receive: Receive | N
             elif self.path == f"{path}events" and events is not None:
                 self._send_events(events())
             elif self.path == path:
+                body = text().encode("utf-8")
                 self._send_head("text/html; charset=utf-8", len(body))
                 self.wfile.write(body)
             else:

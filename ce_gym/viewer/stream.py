@@ -83,10 +83,12 @@ class LivePage:
     Attributes:
         feed: The events that browsers receive.
         notice: Message that the page shows.
+        error: Error that ended the page.
     """
 
     def __init__(self, name: str) -> None:
         self.feed, self.notice = Feed(), ""
+        self.error: Exception | None = None
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._background = ThreadPoolExecutor(1, thread_name_prefix=name)
@@ -95,6 +97,10 @@ class LivePage:
     def html(self) -> str:
         """Return the page."""
         raise NotImplementedError
+
+    def events(self) -> Iterator[bytes]:
+        """Yield the events for one browser."""
+        return self.feed.events()
 
     def update(self) -> float:
         """Simulate and send; return the time until the next update [s]."""
@@ -111,6 +117,12 @@ class LivePage:
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()
+
+    def wait(self) -> None:
+        """Wait until the page has ended, and raise its error."""
+        self._ended.wait()
+        if self.error:
+            raise self.error
 
     def close(self) -> None:
         """Stop the threads, and wait until they have ended."""
@@ -144,7 +156,7 @@ class LivePage:
 def serving(live: LivePage) -> Iterator[str]:
     """Run a live page and its server; yield the address."""
     with contextlib.closing(live):
-        server = PageServer(live.html(), live.feed.events, live.receive)
+        server = PageServer(live.html, live.events, live.receive)
         with contextlib.closing(server):
             live.start()
             yield server.url
@@ -166,4 +178,4 @@ def serve(live: LivePage, verb: str, *, open_browser: bool, until_eof: bool = Fa
         if until_eof:
             sys.stdin.buffer.read()
         else:
-            threading.Event().wait()
+            live.wait()

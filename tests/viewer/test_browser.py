@@ -161,7 +161,7 @@ def test_rotors_turn_and_x_ray_shows_them_in_the_first_robot(at_rest: Chromium, 
 
 
 def test_boxes_hide_robots_and_arrows(at_rest: Chromium, tmp_path: Path) -> None:
-    names = at_rest.run("[...document.querySelectorAll('#about li')].map(item => item.textContent)")
+    names = at_rest.run("[...document.querySelectorAll('#about > ul > li')].map(item => item.textContent)")
     assert names == ["exact", "armature", "contact forces", "commanded speed", "actual speed"]
     for number in (3, 4, 5):
         box = f"#about li:nth-child({number}) input"

@@ -62,7 +62,7 @@ class Runner(LivePage):
         return filled(
             "live",
             self.scene.robot.name,
-            scripts=("stream", "live"),
+            scripts=("belts", "overlays", "stream", "live"),
             constants={
                 "COMMANDS": packed_commands(self.scene.commands()),
                 "OFFER": {"choices": choices, "figures": RANGES, "bodies": bodies},

@@ -1,9 +1,9 @@
 """Belts between a rotor and a joint that it drives from another axis, visible through transparent links.
 
 A robot file gives the ratio of rotor and joints, not the kind of transmission. A belt is drawn where both axes are
-parallel and farther apart than a pulley is wide: two strands, tangents to pulleys of one size, and a pulley on each
-joint's axis. A belt that continues to a further joint runs over a free pulley on the axis between, so that its rotor
-turns equally far with every joint on the way. Rotors with other ratios belong to differentials and have no belt.
+parallel and farther apart than two pulleys are wide: two strands, tangents to pulleys of one size, and a pulley on
+each joint's axis. A belt that continues to a further joint runs over a free pulley on the axis between, so that its
+rotor turns equally far with every joint on the way. Rotors with other ratios belong to differentials and have no belt.
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from ce_gym.model.constraints import LinearConstraint
 from ce_gym.model.description import Body, Robot, Shape
-from ce_gym.model.frames import Placement
-from ce_gym.viewer.page.fallback_shapes import DARK, LIGHT, frame_along, rotor_discs
+from ce_gym.viewer.page.fallback_shapes import DARK, LIGHT, frame_along, placed_at, rotor_discs
 
 Array = NDArray[np.float64]
 
@@ -88,7 +87,7 @@ def _stages(robot: Robot, constraint: LinearConstraint, rotor: Body, radius: flo
             return []
         place, other = _axis(link)
         across = place - at - axis * (axis @ (place - at))
-        if abs(axis @ other) < 0.99 or np.linalg.norm(across) < 2 * radius:
+        if abs(axis @ other) < 0.99 or np.linalg.norm(across) < 4 * radius:
             return []  # gears
         stages.append(_Stage(carrier, link, at, across, axis, 1 if axis @ other > 0 else -1))
         turns.append(waiting.pop(link.name) * stages[-1].sign)
@@ -109,16 +108,11 @@ def _strands(stage: _Stage, radius: float, links: tuple[tuple[str, int], ...]) -
     size, middle = (length, 0.12 * radius, 0.5 * radius), stage.at + stage.across / 2
     # A pulley that turns about z moves its side of y against x.
     return [
-        Part(Shape("box", size, _placed(middle + s * radius * side, frame), (*DARK, 1.0)), links, reach=-s * radius)
+        Part(Shape("box", size, placed_at(middle + s * radius * side, frame), (*DARK, 1.0)), links, reach=-s * radius)
         for s in (1, -1)
     ]
 
 
 def _pulley(at: Array, axis: Array, radius: float, links: tuple[tuple[str, int], ...]) -> Part:
-    shape = Shape("cylinder", (radius, 0.6 * radius), _placed(at, frame_along(axis)), (*LIGHT, 1.0))
+    shape = Shape("cylinder", (radius, 0.6 * radius), placed_at(at, frame_along(axis)), (*LIGHT, 1.0))
     return Part(shape, links, axis)
-
-
-def _placed(position: Array, frame: Array) -> Placement:
-    x, y, z = (tuple(row) for row in frame.tolist())
-    return Placement(tuple(position.tolist()), (x, y, z))

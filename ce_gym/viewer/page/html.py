@@ -65,7 +65,7 @@ def page(
     return filled(
         "player",
         title or " / ".join(dict.fromkeys(Path(rollout.robot).stem for rollout in rollouts)),
-        scripts=("belts", "graph", "plots", "player"),
+        scripts=("belts", "overlays", "graph", "plots", "player"),
         constants={
             "COMMANDS": packed_commands(build_scene(runs, spacing=spacing)),
             "DATA": _data(runs, plot, ghosts=spacing == 0),
@@ -145,12 +145,18 @@ def filled(name: str, title: str, *, scripts: Sequence[str], constants: Mapping[
     # Without "<" no text can end its script.
     lines = [f"const {key} = {json.dumps(value)};\n".replace("<", "\\u003c") for key, value in constants.items()]
     codes = [meshcat_code(), "".join(lines), *(_source(f"{script}.js") for script in ("ground", "scene", *scripts))]
+    return _substituted(name, title, scripts="\n".join(f"<script>\n{code}</script>" for code in codes), **values)
+
+
+def waiting_page(title: str) -> str:
+    """Return the page that is shown until a live page is ready."""
+    return _substituted("waiting", title)
+
+
+def _substituted(name: str, title: str, **values: str) -> str:
     common = {"title": html.escape(title), "plotstyle": _source("plots.css")}
-    return string.Template(_source(f"{name}.html")).substitute(
-        common | values,
-        head=string.Template(_source("head.html")).substitute(common),
-        scripts="\n".join(f"<script>\n{code}</script>" for code in codes),
-    )
+    head = string.Template(_source("head.html")).substitute(common)
+    return string.Template(_source(f"{name}.html")).substitute(common | values, head=head)
 
 
 def _source(name: str) -> str:

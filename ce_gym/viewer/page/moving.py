@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ce_gym.sim.terrain import Terrain
 from ce_gym.viewer.page import three
 from ce_gym.viewer.page.lights_and_camera import TILE, camera_commands, eye, field_command, surroundings
+from ce_gym.viewer.page.overlays import overlay_commands
 from ce_gym.viewer.page.robot import body_paths, extent, joint_poses, placed_scans, pose_bodies, robot_commands
 from ce_gym.viewer.page.scene import GHOST_OPACITY, GHOST_TINTS
 from ce_gym.viewer.page.three import Command
@@ -61,6 +62,7 @@ class MovingScene:
         for index in range(len(self.paths)):
             tint, opacity = (GHOST_TINTS[index - 1], GHOST_OPACITY) if index else (None, 1.0)
             commands += robot_commands(self.robot, f"{WORLD}/{index}", tint=tint, opacity=opacity)
+        commands += overlay_commands(self.robot, f"{WORLD}/0")
         return [*commands, *camera_commands(eye(self._extent.radius))]
 
     def send(self, feed: Feed, models: Sequence[Model], poses: Sequence[Array], state: Any = None) -> bool:

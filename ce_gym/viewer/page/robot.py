@@ -161,7 +161,7 @@ def robot_commands(
         for index, shape in enumerate(shapes[body.name]):
             color = tint or shape.color
             path = f"{paths[body.name]}/{body.kind}_{index}"
-            yield _shape_command(path, shape, color, opacity * shape.color[3])
+            yield shape_command(path, shape, color, opacity * shape.color[3])
             if body.kind == "rotor" and isinstance(shape, Shape) and shape.type == "cylinder":
                 yield _spoke_command(f"{path}_spoke", shape, color, opacity)
         if body.name in inside:
@@ -176,14 +176,14 @@ def mark_commands(robot: Robot, root: str, marks: Mapping[str, Sequence[Shape]])
     paths = body_paths(robot, root)
     for name, shapes in marks.items():
         for index, shape in enumerate(shapes):
-            yield _shape_command(f"{paths[name]}/mark_{index}", shape, shape.color[:3], shape.color[3])
+            yield shape_command(f"{paths[name]}/mark_{index}", shape, shape.color[:3], shape.color[3])
 
 
 def _part_commands(
     path: str, part: Part, robot: Robot, paths: dict[str, str], color: Color, opacity: float
 ) -> Iterator[Command]:
     """Draw a rotor, pulley or strand, visible through transparent links."""
-    command = _shape_command(path, part.shape, color, opacity)
+    command = shape_command(path, part.shape, color, opacity)
     if part.links:  # belts.js moves the part
         length, width, height = part.shape.size if part.shape.type == "box" else (0.0, 0.0, 0.0)
         command["object"]["object"]["userData"] = {
@@ -205,7 +205,8 @@ def _joint(body: Body, path: str, sign: int) -> Command:
     return {"path": path, "rest": rest, "axis": list(body.joint.axis), "sign": sign}
 
 
-def _shape_command(path: str, shape: Shape | Triangles, color: Color, opacity: float) -> Command:
+def shape_command(path: str, shape: Shape | Triangles, color: Color, opacity: float) -> Command:
+    """Draw a shape in the frame of a path."""
     matrix = _matrix(shape.placement)
     if isinstance(shape, Triangles):
         return three.mesh(path, three.triangles(shape.vertices, shape.faces), color, matrix, opacity=opacity, flat=True)

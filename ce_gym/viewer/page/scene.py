@@ -17,6 +17,7 @@ from ce_gym.viewer.errors import ViewerError
 from ce_gym.viewer.meshes.triangles import MOST
 from ce_gym.viewer.page import arrows, three
 from ce_gym.viewer.page.lights_and_camera import camera_commands, eye, field_command, surroundings
+from ce_gym.viewer.page.overlays import overlay_commands
 from ce_gym.viewer.page.poses import PosedRollout, smooth
 from ce_gym.viewer.page.robot import body_paths, placed_scans, robot_commands
 from ce_gym.viewer.page.three import Color, Command
@@ -80,6 +81,7 @@ def build_scene(runs: Sequence[PosedRollout], *, spacing: float | None = None) -
         commands += robot_commands(run.robot, run.path, tint=tint, opacity=opacity, triangles=MOST // len(runs))
         commands.append(three.set_transform(run.path, poses[index]))
         clips += run.clips(end)
+        commands += () if ghost else overlay_commands(run.robot, run.path)
         for arrow in () if ghost else arrows.all_arrows(run):
             commands += arrow.commands()
             clips.append(three.clip(arrow.path, run.times, end, arrow.values()))

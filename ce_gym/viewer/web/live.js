@@ -1,28 +1,9 @@
-// The live page: shows the state that the server sends, and posts what the user does. Expects OFFER, scene.js and stream.js.
+// The live page: shows the state that the server sends, and posts what the user does. Expects OFFER, scene.js,
+// overlays.js and stream.js.
 
-drawBehind(node("/world/1").object);
+addGhost("/world/1");
+offerOverlays();
 const show = (path, on) => { node(path).object.visible = on; };
-
-// Posts one message at a time. Of messages of one kind that wait, only the newest is sent.
-const waiting = new Map();
-let busy = false;
-function post(message) {
-  waiting.delete(message.do);
-  waiting.set(message.do, message);
-  if (!busy) send();
-}
-async function send() {
-  busy = true;
-  while (waiting.size) {
-    const [kind, message] = waiting.entries().next().value;
-    waiting.delete(kind);
-    try {
-      const answer = await fetch("messages", { method: "POST", body: JSON.stringify(message) });
-      if (!answer.ok) find("notice").textContent = "refused: " + JSON.stringify(message);
-    } catch { find("notice").textContent = "has stopped"; }
-  }
-  busy = false;
-}
 
 function tell() {
   const [forward, left, turn] = state.command, [vx, vy] = state.base.velocity;
@@ -181,6 +162,7 @@ function drawPull() {
     const ends = [drag.object.localToWorld(drag.point.clone()), node("/world").object.localToWorld(drag.target.clone())];
     line.geometry.setFromPoints(ends.map(end => viewer.scene.worldToLocal(end)));
   }
+  moveOverlays();
   viewer.set_dirty();
   requestAnimationFrame(drawPull);
 }

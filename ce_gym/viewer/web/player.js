@@ -1,11 +1,9 @@
-// The controls of a page that plays rollouts. Expects DATA and FRAME, scene.js, belts.js, graph.js and plots.js.
+// The controls of a page that plays rollouts. Expects DATA and FRAME, scene.js, belts.js, overlays.js, graph.js and plots.js.
 
 const robots = DATA.robots.map(robot => ({
   ...robot, times: numbers(robot.times, Float32Array), signals: unpacked(robot.signals),
   commanded: unpacked(robot.commanded), effort: numbers(robot.effort, Uint8Array),
 }));
-
-findBelts();
 
 // Time.
 const animator = viewer.animator;
@@ -33,26 +31,7 @@ function follow(on) {
   animator.actions[0].setEffectiveWeight(on ? 1 : 0);
   animator.mixer.update(0);
 }
-// X-ray leaves ghosts unchanged: two transparent robots could not be told apart.
-const ghostly = new Set();
-robots.forEach((robot, i) => {
-  if (!robot.ghost) return;
-  node(`/world/${i}`).object.traverse(object => ghostly.add(object));
-  drawBehind(node(`/world/${i}`).object);
-});
-function xray(on) {
-  viewer.scene.traverse(object => {
-    if (ghostly.has(object)) return;
-    if (object.name === "inside") object.visible = on;
-    if (!object.isMesh || !/^link_\d+$/.test(object.parent.name)) return;
-    const material = object.material;
-    material.userData.opacity ??= material.opacity;
-    material.opacity = material.userData.opacity * (on ? 0.3 : 1);
-    material.transparent = material.opacity < 1;
-    material.depthWrite = !on;
-    material.needsUpdate = true;
-  });
-}
+robots.forEach((robot, i) => { if (robot.ghost) addGhost(`/world/${i}`); });
 
 // Links of solid robots with the number of their joint; links without a motor stay grey.
 const REST = new THREE.Color(0xcfd8e1), HALF = new THREE.Color(0xf2b134), FULL = new THREE.Color(0xd7263d);
@@ -79,11 +58,7 @@ function torque(on) {
 }
 if (!painted.length) find("torque").parentElement.style.display = "none";
 
-const switches = { follow, xray, torque, charts: on => { find("plots").style.display = on ? "" : "none"; } };
-for (const [id, change] of Object.entries(switches)) {
-  find(id).onchange = event => { change(event.target.checked); viewer.set_dirty(); };
-}
-for (const box of document.querySelectorAll("#about input")) {
+for (const box of document.querySelectorAll("#about [data-paths]")) {
   box.onchange = () => {
     for (const path of JSON.parse(box.dataset.paths)) node(path).object.visible = box.checked;
     viewer.set_dirty();
@@ -96,13 +71,10 @@ const plots = makePlots(find("plots"), robots, DATA.chosen.slice(0, few), {
 if (!DATA.chosen.length) for (const hidden of [find("plots"), find("charts").parentElement]) hidden.style.display = "none";
 
 // Text after # in the address sets the view: #t=4.2&xray&torque&charts=0 opens the page paused at 4.2 s.
-for (const [key, value] of new URLSearchParams(location.hash.slice(1))) {
-  if (key === "t") seek(Number(value));
-  if (key in switches) {
-    find(key).checked = value !== "0";
-    find(key).onchange({ target: find(key) });
-  }
-}
+const wanted = new URLSearchParams(location.hash.slice(1));
+if (wanted.has("t")) seek(Number(wanted.get("t")));
+offerOverlays();
+connect({ follow, torque, charts: on => { find("plots").style.display = on ? "" : "none"; } });
 
 // In a narrow window the robot stands above plots and bar.
 function shift() {
@@ -117,7 +89,7 @@ shift();
 
 function refresh() {
   moveFields();
-  if (find("xray").checked) moveBelts();
+  moveOverlays();
   find("play").innerHTML = animator.playing ? "&#10074;&#10074;" : "&#9654;";
   if (document.activeElement !== find("time") || animator.playing) find("time").value = animator.time;
   find("clock").value = animator.time.toFixed(2) + " / " + animator.duration.toFixed(2) + " s";
