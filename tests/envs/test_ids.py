@@ -90,9 +90,7 @@ def test_commands_name_id_and_argument_in_one_line(line: str, capsys: pytest.Cap
 
 
 def test_a_policy_of_another_level_s_id_names_id_and_argument():
-    with pytest.raises(
-        PolicyError, match=r'MODULE:.* use gymnasium\.make\("ce_gym/TelloStand-v0", transmission='
-    ):
+    with pytest.raises(PolicyError, match=r'MODULE:.* use gymnasium\.make\("ce_gym/TelloStand-v0", transmission='):
         environment_of({"env": "ce_gym/TelloStand-None-v0"})
 
 
