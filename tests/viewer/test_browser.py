@@ -178,6 +178,16 @@ def test_boxes_hide_robots_and_arrows(at_rest: Chromium, tmp_path: Path) -> None
     assert count(both, pixels(at_rest, tmp_path / "again.png"), 30) < 50
 
 
+def test_overlays_follow_the_first_robot(at_rest: Chromium, twins: list[Rollout], tmp_path: Path) -> None:
+    for kind in ("contacts", "frames", "inertia", "collision"):
+        assert count(*toggled(at_rest, f"#{kind}", tmp_path)) > 100, kind
+    click(at_rest, "#center")
+    at_rest.settle()
+    (found,) = at_rest.run("overlayNodes('center').map(object => object.position.toArray())")  # none for the ghost
+    click(at_rest, "#center")
+    np.testing.assert_allclose(found, Model(ROBOT).center_of_mass(twins[0].q[round(1.0 / STEP)]), atol=1e-3)
+
+
 def test_torque_at_its_limit_is_red(at_rest: Chromium) -> None:
     def colors() -> dict[str, str]:
         return at_rest.run(

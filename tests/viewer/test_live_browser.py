@@ -50,6 +50,15 @@ def test_the_stick_turns_it(browser: Chromium):
     browser.until("state.command[2] === 0")
 
 
+def test_overlays_and_rotors_are_seen(browser: Chromium):
+    browser.run("['xray', 'contacts', 'center'].forEach(kind => find(kind).click())")
+    browser.settle()
+    assert browser.run("overlayNodes('contacts').every(group => group.visible)") is True
+    assert browser.run("node('/world/0').object.getObjectByName('inside').visible") is True
+    assert browser.run("overlayNodes('center')[0].position.z") == pytest.approx(0.27, abs=0.08)
+    browser.run("['xray', 'contacts', 'center'].forEach(kind => find(kind).click())")
+
+
 def test_a_drag_pulls_the_body_that_is_seen_there(browser: Chromium):
     x, y = browser.run(BASE)
     browser.mouse("mousePressed", x, y)

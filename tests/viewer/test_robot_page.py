@@ -124,6 +124,7 @@ def test_the_kind_of_file_decides(name: str, tmp_path: Path, monkeypatch: pytest
         served.append((page.html().partition("<title>")[2].partition("</title>")[0], open_browser))
 
     monkeypatch.setattr("ce_gym.viewer.stream.serve", record)
+    monkeypatch.setattr("ce_gym.viewer.preparing.GRACE", 60.0)
     assert main(["view", name]) == main(["view", name, "--no-open"]) == 0
     assert served == [("mini_cheetah" if name == "mini_cheetah" else "pup", opens) for opens in (True, False)]
 
@@ -154,6 +155,7 @@ def test_the_page_opens_before_the_robot_is_compiled(monkeypatch: pytest.MonkeyP
 
 
 def test_errors_before_and_after_the_page_opens_reach_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ce_gym.viewer.preparing.GRACE", 60.0)
     with pytest.raises(RobotError, match="nobody"):
         Preparing("nobody", lambda: RobotPage(load_robot("nobody")))
     monkeypatch.setattr("ce_gym.viewer.preparing.GRACE", 0.0)
