@@ -13,7 +13,7 @@ from ce_gym.diagnostics.scene import scene_report
 from ce_gym.dynamics.forces.scene import SceneOptions
 from ce_gym.dynamics.model import Model
 from ce_gym.envs.custom import register_robot, register_task
-from ce_gym.envs.registration import environment_ids, explain_levels, register_environments
+from ce_gym.envs.registration import environment_ids, register_environments
 from ce_gym.envs.rendering import use_renderers
 from ce_gym.envs.terms.registry import metric, observation, reward, termination
 from ce_gym.model import InertiaWarning, LossyImportWarning, Robot, RobotError, load_robot, robots
@@ -57,6 +57,5 @@ __all__ = [
 ]
 
 register_environments()
-explain_levels()
 use_renderers("ce_gym.viewer.renderers")
 load_plugins()

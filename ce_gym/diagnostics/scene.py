@@ -174,11 +174,9 @@ def scene_report(env_id: str, **arguments: Any) -> str:
 
 def count_instructions(env_id: str, **arguments: Any) -> SceneReport:
     """Count the instructions of a registered environment; see `scene_report`."""
-    try:
-        spec = gymnasium.spec(env_id)
-    except gymnasium.error.Error as error:
-        known = "`python -m ce_gym list` shows the known ids"
-        raise ValueError(f"environment {env_id!r} is not registered; {known} ({error})") from None
+    spec = gymnasium.registry.get(env_id)
+    if spec is None:
+        raise ValueError(f"environment {env_id!r} is not registered; `python -m ce_gym list` shows the known ids")
     kwargs = {**spec.kwargs, **arguments}
     if not {"robot", "task"} <= kwargs.keys():
         raise ValueError(f"environment {env_id!r}: made with {', '.join(kwargs) or 'nothing'}; expected robot and task")

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import gymnasium
-from gymnasium.envs import registration
 
 from ce_gym.envs.task.skills import SKILLED, SKILLS
 from ce_gym.envs.task.tasks import TASKS, Task
 from ce_gym.model.errors import invalid_value
-from ce_gym.model.mechanism import ELASTIC, LEVELS
 
 QUADRUPEDS = ("mini_cheetah", "go1", "go2", "anymal_c", "spot")
 BIPEDS = ("mit_humanoid", "tello", "jvrc1", "g1", "h1", "t1", "berkeley_humanoid", "cassie", "dr_legs")
@@ -112,22 +110,3 @@ def register(name: str, arguments: Mapping[str, str], task: Task, threshold: flo
         max_episode_steps=task.episode_length,
         kwargs=dict(arguments),
     )
-
-
-def explain_levels() -> None:
-    """Add the id and the argument to use to Gymnasium's error for an id with another level, such as "-None".
-
-    Gymnasium has no hook for unknown ids. Ids that only raise an error would stand in each list of environments.
-    """
-    check = getattr(registration, "_check_name_exists", None)
-    if check is None:  # a later Gymnasium: its own error suggests the id
-        return
-
-    def check_name(namespace: str | None, name: str) -> None:
-        stem, _, level = name.partition("-")
-        if f"{namespace}/{stem}-Armature-v0" in gymnasium.registry and level.lower() in (*LEVELS, ELASTIC):
-            call = f'gymnasium.make("{namespace}/{stem}-v0", transmission="{level.lower()}")'
-            raise gymnasium.error.NameNotFound(f"{namespace}/{name}: levels are an argument; use {call}")
-        check(namespace, name)
-
-    registration._check_name_exists = check_name

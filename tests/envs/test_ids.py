@@ -15,10 +15,9 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 import ce_gym
-from ce_gym.__main__ import main
 from ce_gym.envs.registration import BIPEDS
 from ce_gym.envs.runtime.setup import own_task
-from ce_gym.policies import PolicyError, environment_of, registered, shelf
+from ce_gym.policies import shelf
 
 IDS = sorted(ce_gym.environment_ids())
 VELOCITY = "ce_gym/MiniCheetahVelocity-v0"
@@ -70,28 +69,6 @@ def test_ids_are_few():
     assert set(IDS) <= listed
     assert len(IDS) <= 160
     assert {re.sub(r"-Armature(?=-v0)", "", env_id) for env_id in IDS} == {i for i in IDS if "-Armature" not in i}
-
-
-@pytest.mark.parametrize("level", ["Exact", "Coupled", "None", "Elastic"])
-@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec, gymnasium.spec, registered])
-def test_the_error_for_another_level_names_id_and_argument(make, level: str):
-    with pytest.raises(gymnasium.error.NameNotFound) as error:
-        make(f"ce_gym/TelloStand-{level}-v0")
-    use = f'use gymnasium.make("ce_gym/TelloStand-v0", transmission="{level.lower()}")'
-    assert str(error.value) == f"ce_gym/TelloStand-{level}: levels are an argument; {use}"
-
-
-@pytest.mark.parametrize("line", ["inspect ce_gym/TelloStand-None-v0", "train ce_gym/TelloStand-None-v0"])
-def test_commands_name_id_and_argument_in_one_line(line: str, capsys: pytest.CaptureFixture[str]):
-    assert main(line.split()) == 2
-    error = capsys.readouterr().err
-    assert 'gymnasium.make("ce_gym/TelloStand-v0", transmission="none")' in error
-    assert error.count("\n") == 1
-
-
-def test_a_policy_of_another_level_s_id_names_id_and_argument():
-    with pytest.raises(PolicyError, match=r'MODULE:.* use gymnasium\.make\("ce_gym/TelloStand-v0", transmission='):
-        environment_of({"env": "ce_gym/TelloStand-None-v0"})
 
 
 def test_unknown_ids_have_the_error_of_gymnasium():
