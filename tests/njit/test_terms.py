@@ -24,7 +24,7 @@ numba = pytest.importorskip("numba")
 
 from ce_gym.numba import reward, termination  # noqa: E402
 
-ID = "ce_gym/MiniCheetahVelocity-None-v0"
+ID = "ce_gym/MiniCheetahVelocity-Armature-v0"
 USED = {
     "rewards": dict.fromkeys(VELOCITY.rewards, 0.0) | {"drift": {"weight": 0.5, "share": 0.25}, "alive": 0.2},
     "terminations": ["torso_contact", "low"],

@@ -69,6 +69,8 @@ def draw_curve(rows: list[dict[str, float]], title: str, file: Path) -> None:
         title: Heading.
         file: PNG file to write.
     """
+    from PIL import Image
+
     figure, axes = _figure(2, 8.0, 2.6)
     steps = np.array([row["steps"] for row in rows]) / 1e6
     for ax, key, label in zip(axes, ("reward", "length"), ("reward", "control steps"), strict=True):
@@ -82,3 +84,6 @@ def draw_curve(rows: list[dict[str, float]], title: str, file: Path) -> None:
     figure.suptitle(title, fontsize=10)
     with written(file, PICTURE) as temporary:
         figure.savefig(temporary, dpi=80)
+        with Image.open(temporary) as picture:  # few colours: a quarter of the size
+            small = picture.convert("RGB").quantize(32)
+        small.save(temporary, "PNG", optimize=True)
