@@ -22,7 +22,7 @@ from ce_gym.model.errors import listed_names
 
 BENCHMARKS = (
     "speed", "beside", "instructions", "throughput", "tracking", "stability", "accuracy", "derivatives",
-    "dynamics", "growth", "gpu", "digests", "all",
+    "dynamics", "growth", "cube", "go2_log", "gpu", "digests", "all",
 )  # fmt: skip
 
 

@@ -51,6 +51,7 @@ def fix_base(robot: Robot, names: Collection[str]) -> Robot:
         independent=tuple(name for name in robot.independent if name in kept),
         contacts=(),
         capsules=(),
+        frames=tuple(frame for frame in robot.frames if frame.body in kept),
         self_collisions=(),
         motors=tuple(motor for motor in robot.motors if motor.rotor in kept),
         elastic=tuple(elastic for elastic in robot.elastic if elastic.rotor in kept),

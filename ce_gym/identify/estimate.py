@@ -67,6 +67,7 @@ def identify(
     method: str = METHOD,
     longest_delay: float = 0.03,
     held_out: float = 0.2,
+    simulate: type[Shooting] = Shooting,
 ) -> Identified:
     """Estimate parameters of a robot with a fixed base and its feet in the air, from a log of commands and encoders.
 
@@ -83,6 +84,7 @@ def identify(
         method: Time-stepping method, as in `Simulator`.
         longest_delay: Upper bound of the delay [s].
         held_out: Share of the log, at its end, that validates the fit.
+        simulate: Class that simulates windows of the log; a subclass can use another simulator.
 
     Raises:
         LogError: The log does not fit the robot.
@@ -102,7 +104,7 @@ def identify(
     parameters = select_parameters(model.robot, kinds, fixed, longest_delay, log.measured)
     log = _sort_commands(model, log, control)
     options = {"control": control, "method": method, "num_threads": usable_cores()}
-    shooting = Shooting(model, log, parameters, substep, **options)
+    shooting = simulate(model, log, parameters, substep, **options)
     fit_windows, validation_windows = split_log(log, window, longest_delay, held_out)
     problem, x = _fit(shooting, fit_windows)
     values, correlation = problem.values(x), correlation_time(problem.residual)

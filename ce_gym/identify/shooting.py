@@ -158,11 +158,10 @@ class Shooting:
             sim.set_parameter(name, np.repeat(column, W, axis=0))
         flat = states.reshape(C * W, -1)
         sim.set_state(flat[:, :nq], flat[:, nq:])
-        delays = [values[:, k] for k, parameter in enumerate(self.parameters) if parameter.kind == "delay"]
-        start = np.tile(first, C) - np.repeat(delays[0] if delays else np.zeros(C), W) / self.log.dt
-        readings, integral = [self.encoders(flat[:, :nq], flat[:, nq:])], self._integral(start)
+        start = self.starts(values, first)
+        readings, integral = [self.encoders(flat[:, :nq], flat[:, nq:])], self.integral(start)
         for k in range((length - 1) * self.substeps):
-            next_integral = self._integral(start + (k + 1) / self.substeps)
+            next_integral = self.integral(start + (k + 1) / self.substeps)
             sim.step((next_integral - integral) * self.substeps)
             integral = next_integral
             if (k + 1) % self.substeps == 0:
@@ -178,9 +177,15 @@ class Shooting:
         offsets[self._offsets[:, 1]] = values[self._offsets[:, 0]]
         return offsets
 
-    def _integral(self, rows: Array) -> Array:
-        """Return the integral of the commands up to fractional rows (R,), in units of dt, shape (R, n_commands)."""
+    def starts(self, values: Array, first: Indices) -> Array:
+        """Return the fractional rows of the commands at the starts of windows, shape (C * W,): earlier by the delay."""
+        delays = [values[:, k] for k, parameter in enumerate(self.parameters) if parameter.kind == "delay"]
+        delay = delays[0] if delays else np.zeros(len(values))
+        return np.tile(first, len(values)) - np.repeat(delay, len(first)) / self.log.dt
+
+    def integral(self, rows: Array) -> Array:
+        """Return the integral of the commands up to fractional rows (...), in units of dt, shape (..., n_commands)."""
         rows = np.clip(rows, 0.0, len(self._command_sums) - 1.0)
         whole = np.minimum(rows.astype(np.int64), len(self._command_sums) - 2)
         sums = self._command_sums
-        return sums[whole] + (rows - whole)[:, None] * (sums[whole + 1] - sums[whole])
+        return sums[whole] + (rows - whole)[..., None] * (sums[whole + 1] - sums[whole])

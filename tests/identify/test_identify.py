@@ -45,6 +45,13 @@ def result(leg: Robot, log: Log) -> Identified:
     return identify(leg, log, kinds=KINDS)
 
 
+def test_frames_on_the_base_are_left_out():
+    """Go2's file has frames on its head."""
+    go2 = fix_base(load_robot("go2"), ["FL_calf"])
+    assert {frame.body for frame in go2.frames} <= {body.name for body in go2.bodies}
+    assert Model(go2).nv == 3
+
+
 def test_planted_parameters_are_found(result: Identified):
     for name, value in PLANTED.items():
         assert result[name] == pytest.approx(value, rel=0.02), name

@@ -1,0 +1,1 @@
+"""Comparisons with measurements of real systems."""
