@@ -81,8 +81,9 @@ _BARE = (
 )
 _BARE += r"|Observations|VecEnvIndices|VecEnvStepReturn|EzPickle|Generic|Env|VectorEnv|Literal.*|optional|float64|bool_"
 _BARE += r"|Device)"
-_INNER = r"ce_gym\.(sim\.devices|envs\.(base|runtime|terms)|model\.mechanism|dynamics\.recursion)\..*"
-nitpick_ignore_regex = [(r"py:.*", pattern) for pattern in (_ELSEWHERE, _BARE, _INNER)]
+_INNER = r"ce_gym\.(sim\.devices|identify\.shooting|envs\.(base|runtime|terms)|model\.mechanism)\..*"
+_RECURSION = r"ce_gym\.dynamics\.recursion\..*"
+nitpick_ignore_regex = [(r"py:.*", pattern) for pattern in (_ELSEWHERE, _BARE, _INNER, _RECURSION)]
 
 
 def setup(app: Any) -> None:

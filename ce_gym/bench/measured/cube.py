@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -91,8 +92,14 @@ def fit(engine: Ours | Peer, tosses: Tosses) -> tuple[Candidates, float]:
 
     n = len(names)
     cells = np.argsort(np.random.default_rng(0).random((n, POPULATION)), axis=1).T  # a Latin hypercube
-    options = {"maxiter": GENERATIONS, "init": (cells + 0.5) / POPULATION, "polish": False, "tol": 0.0}
-    result = differential_evolution(error, [(0.0, 1.0)] * n, vectorized=True, updating="deferred", seed=0, **options)
+    options: dict[str, Any] = {
+        "seed": 0,
+        "maxiter": GENERATIONS,
+        "init": (cells + 0.5) / POPULATION,
+        "polish": False,
+        "tol": 0.0,
+    }
+    result = differential_evolution(error, [(0.0, 1.0)] * n, vectorized=True, updating="deferred", **options)
     return parameters(result.x), float(result.fun)
 
 

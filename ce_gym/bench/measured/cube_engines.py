@@ -91,7 +91,8 @@ class Peer:
         datas = [mujoco.MjData(models[0]) for _ in range(usable_cores())]
         states = np.hstack([np.zeros((len(q), 1)), q, v])
         steps = SUBSTEPS * (tosses.poses.shape[1] - 1)
-        after, _ = rollout.rollout([model for model in models for _ in range(n)], datas, states, nstep=steps)
+        repeated = [model for model in models for _ in range(n)]
+        after = np.asarray(rollout.rollout(repeated, datas, states, nstep=steps)[0])
         poses = np.concatenate([q[:, None], after[:, SUBSTEPS - 1 :: SUBSTEPS, 1:8]], axis=1)
         return above(poses, ground, n)
 

@@ -71,7 +71,7 @@ class PeerShooting(Shooting):
         control = np.empty_like(targets)
         control[..., self._actuators] = targets
         datas = [mujoco.MjData(self._mujoco) for _ in range(usable_cores())]
-        after, _ = rollout.rollout(models, datas, start, control)
+        after = np.asarray(rollout.rollout(models, datas, start, control)[0])
         after = np.concatenate([start[:, None], after[:, self.substeps - 1 :: self.substeps]], axis=1)
         q, v = after[..., 1 + self._qpos], after[..., 1 + self._mujoco.nq + self._qvel]
         last = np.hstack([q[:, -1], v[:, -1]]).reshape(C, W, -1)
