@@ -184,7 +184,7 @@ def test_checks_of_the_numpy_loop(tmp_path):
 
     assert counts(0.0, 0.0) == {}
     assert counts(dt, dt + 1.5 * dt) == {"late": 1}
-    assert counts(2.5 * dt, 2.5 * dt) == {"rate": 1}
+    assert counts(2.5 * dt, 2.5 * dt).get("rate") == 1
     assert counts(3.5 * dt, 3.5 * dt, velocities=np.full(n, 1e4)).get("saturated") == 1
     loop.layers[-1] = tuple(1000 * array for array in loop.layers[-1])
     assert counts(4.5 * dt, 4.5 * dt).get("clipped") == 1

@@ -65,18 +65,18 @@ def test_a_teacher_sees_the_numbers_of_its_own_environment(path):
     teacher = load_policy(settings.teacher)
     exactly = {"start": {}, "push_period": 0.0, "randomise": {}, "noise": {}}
     his, mine = (
-        gymnasium.make_vec(ROBOT, num_envs=4, **{**given, **exactly})
+        gymnasium.make_vec(teacher.record["env"], num_envs=4, **{**given, **exactly})
         for given in (teacher.record["env_kwargs"], kwargs)
     )
     columns = teacher_columns(teacher, settings.teacher, mine.unwrapped, kwargs)
     his.reset(seed=0), mine.reset(seed=0)
     for envs in (his, mine):
-        envs.step(np.zeros((4, 12), F))
+        envs.step(np.zeros(envs.action_space.shape, F))
     there, here = his.unwrapped.batch, mine.unwrapped.batch
     for name, row in there.schema.items():
         if not row.dtype and name in here.schema and here.schema[name].size == row.size:
             here.write(name, there.rows(name))  # the state without the memory of sensors
-    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (4, 12)).astype(F)
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, mine.action_space.shape).astype(F)
     theirs, (seen, *_) = his.step(actions)[0], mine.step(actions)
     theirs = theirs["policy"] if isinstance(theirs, dict) else theirs
     np.testing.assert_allclose(seen["critic"][:, columns], theirs, atol=2e-6)
