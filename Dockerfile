@@ -3,8 +3,8 @@ FROM python:3.12-slim
 WORKDIR /src
 COPY . .
 RUN pip install --no-cache-dir ".[viewer,video,train,mjcf]" && rm -rf /src \
-    && useradd --create-home user && install -d -o user /work
+    && useradd --create-home user && install -d -o user /app
 USER user
-WORKDIR /work
+WORKDIR /app
 ENTRYPOINT ["python", "-m", "ce_gym"]
 CMD ["list"]

@@ -151,7 +151,7 @@ def _parser() -> argparse.ArgumentParser:
         help="write a package with a robot and a task of one's own",
         description="Write an installable package with a robot, a task, settings of training, a test and a workflow\n"
         "for GitHub. `import ce_gym` registers its robots and tasks in every process.",
-        epilog=examples("project my_lab", "project my_lab --out ~/work/my_lab"),
+        epilog=examples("project my_lab", "project my_lab --out ~/my_lab"),
     )
     project.add_argument("name", metavar="NAME", help="name of the package, such as my_lab")
     project.add_argument("--out", type=path, metavar="FOLDER", help="a new folder; by default NAME")

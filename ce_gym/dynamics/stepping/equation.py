@@ -220,10 +220,8 @@ class Equation:
 
     def _damped(self, k: int, inertia: SX) -> tuple[SX, SX]:
         """Return what that damping adds to the inertia of a cluster, shape (d, d), and its force, shape (d,)."""
-        carrier, turning = (
-            self.mechanism.tree.clusters[k].output_body,
-            TurningDamping(self.given.state.v, self.given.dt),
-        )
+        carrier = self.mechanism.tree.clusters[k].output_body
+        turning = TurningDamping(self.given.state.v, self.given.dt)
         return turning.on(inertia, self.turned[k], self.system.start.kinematics.bodies[carrier].v[:3])  # type: ignore[index]
 
     @cached_property
